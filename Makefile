@@ -1,0 +1,36 @@
+# make install | study | test | net | clean. Another build of torch: make install TORCH=torch
+PYTHON ?= python3
+VENV ?= .venv
+TORCH ?=
+BIN := $(VENV)/bin
+
+.PHONY: install study test lint net clean
+
+install: $(VENV)/.installed
+
+# torch first: the CPU build where pip offers one, else the release it belongs to, so that no GPU libraries are pulled
+# onto a machine without a GPU by an open version range.
+$(VENV)/.installed: pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+ifeq ($(TORCH),)
+	$(BIN)/python -m pip install --quiet "torch==2.13.0+cpu" || $(BIN)/python -m pip install "torch==2.13.0"
+else
+	$(BIN)/python -m pip install "$(TORCH)"
+endif
+	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	touch $@
+
+study: install
+	$(BIN)/tint-sumo study run --budget quick --out runs/quick
+
+test: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/pytest -n 2
+
+net: install
+	$(BIN)/tint-sumo net --out sumo_net
+
+clean:
+	rm -rf runs build dist .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,205 @@
+"""Every number of the study once, with its unit and its source.
+
+Sources: "paper" is Liu et al., Learning to Navigate Intersections with Unsupervised Driver Trait Inference, ICRA 2022;
+"code" is the authors' published code, used where the paper gives no value; "SUMO" is Eclipse SUMO's default.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from tint_sumo.errors import InputError
+
+MAX_VEHICLES = 12  # surrounding vehicles on the street and in an observation (code)
+WINDOW_STEPS = 20  # steps from which a trait is inferred, and between two inferences (paper III-C, code)
+LATENT_SIZE = 2  # numbers that represent a trait (paper III-B)
+P_CONSERVATIVE = (0.25, 0.4, 0.6)  # driver mixes of the paper's experiments (paper Fig. 4)
+
+POSITION_SCALE_M = 20.0  # positions are observed divided by this (code)
+SPEED_SCALE_MPS = 3.0  # velocities are observed divided by this: the ego's top desired speed
+
+Backend = Literal["auto", "libsumo", "traci"]
+
+
+@dataclass(frozen=True)
+class Street:
+    """The T-intersection in its own frame: x east, y north, origin where the stem meets the lower lane's edge.
+
+    The lower lane runs west at ``lower_y_m``, the upper lane east at ``upper_y_m``; traffic keeps left.
+    """
+
+    half_length_m: float = 20.0  # vehicle centres lie in [-20, 20] (code)
+    lane_width_m: float = 4.0  # code
+    lower_y_m: float = 2.0
+    upper_y_m: float = 6.0
+    junction_half_length_m: float = 6.0
+    turn_radius_m: float = 6.0  # the ego's quarter circle from (0, 0) to (6, 6) (code)
+    stem_length_m: float = 20.0
+    speed_limit_mps: float = 10.0  # above every desired speed, so that it never binds
+
+
+@dataclass(frozen=True)
+class VehicleShape:
+    length_m: float = 5.0  # code
+    width_m: float = 2.0  # code
+
+
+@dataclass(frozen=True)
+class DriverProfile:
+    """One driver trait."""
+
+    name: str
+    desired_speed_mps: float  # paper IV-A
+    min_gap_m: tuple[float, float]  # uniform in this range (paper IV-A)
+    entry_gap_m: tuple[float, float]  # bumper gap behind the leader at placement and entry, uniform (code)
+    yields: bool  # whether the driver reacts to an ego that claims its lane (paper IV-A)
+    colour: str  # of the vehicle in figures and in sumo-gui, "r,g,b"
+
+
+CONSERVATIVE = DriverProfile("conservative", 2.4, (0.5, 0.7), (4.0, 6.0), True, "40,90,200")
+AGGRESSIVE = DriverProfile("aggressive", 3.0, (0.3, 0.5), (3.0, 5.0), False, "200,40,40")
+DRIVER_PROFILES = (CONSERVATIVE, AGGRESSIVE)
+
+
+@dataclass(frozen=True)
+class Idm:
+    """Intelligent Driver Model parameters shared by all drivers (SUMO's carFollowModel="IDM")."""
+
+    accel_mps2: float = 3.0  # code
+    decel_mps2: float = 2.0  # code
+    emergency_decel_mps2: float = 9.0  # code
+    tau_s: float = 1.0  # SUMO; the paper gives none, the code has 1.5
+    delta: float = 4.0  # code
+
+
+@dataclass(frozen=True)
+class Population:
+    """The vTypes drivers are drawn from."""
+
+    members: int = 32  # vTypes per profile, each with its own minGap
+    seed: int = 2022  # of the minGap draws
+    idm: Idm = Idm()
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """How drivers appear on the street."""
+
+    p_conservative: float = 0.4  # probability that a driver is conservative
+    arrivals_per_s: float | None = None  # Poisson rate per lane; None: saturated, enter as soon as there is room
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.p_conservative <= 1.0:
+            raise InputError(f"p_conservative is a probability and must lie in [0, 1], not {self.p_conservative}")
+        if self.arrivals_per_s is not None and not self.arrivals_per_s > 0.0:
+            raise InputError(
+                f"arrivals_per_s must be positive, or None for saturated traffic, not {self.arrivals_per_s}"
+            )
+
+
+@dataclass(frozen=True)
+class EgoController:
+    """The ego's low-level control (code): a PD law on speed, and a safety check that overrides it."""
+
+    desired_speeds_mps: tuple[float, ...] = (0.0, 0.5, 3.0)  # the actions (paper III-C)
+    gain_per_s: float = 2.0
+    accel_limit_mps2: float = 3.0
+    unsafe_distance_m: float = 0.8  # between vehicle boxes
+    closing_distance_m: float = 1.0  # unsafe if also closing faster than closing_speed_mps
+    closing_speed_mps: float = 1.0
+    braking_gain_per_s: float = 5.0
+    braking_limit_mps2: float = 6.0
+
+
+@dataclass(frozen=True)
+class Claim:
+    """When the ego claims a lane, so that its yielding drivers react (code), and how much room they leave it.
+
+    Yielding drivers of the code stand 2 to 4 m behind the ego. With no more than their minGap from the vehicle ahead
+    they would come closer than the ego's safety check allows, and both would wait for ever.
+    """
+
+    approach_speed_mps: float = 0.5  # speed towards the lane that counts as moving in
+    path_margin_m: float = 1.0  # front this far past the lane's border stands in the vehicles' path
+    courtesy_gap_m: float = 1.5  # that yielding drivers add to their minGap while their lane is claimed
+
+
+@dataclass(frozen=True)
+class EpisodeRules:
+    step_s: float = 0.1  # code
+    time_limit_s: float = 50.0  # code
+    ego_start_y_m: float = -5.0  # of the ego's centre, at x = 0 (code)
+    goal_x_m: float = 8.0  # success when the centre is past it, on the upper lane (code)
+
+
+@dataclass(frozen=True)
+class RewardPreset:
+    goal: float
+    collision: float
+    speed_weight_per_mps: float  # times the ego's speed, each other step
+    step: float  # each other step
+
+
+REWARD_PRESETS = {
+    "paper": RewardPreset(2.5, -2.0, 0.05, -0.0013),  # paper IV-A
+    "authors": RewardPreset(2.5, -2.0, 0.05 / 3.0, -0.013),  # code
+}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """All that defines a simulated episode, apart from its seed."""
+
+    traffic: Traffic = Traffic()
+    population: Population = Population()
+    street: Street = Street()
+    vehicle: VehicleShape = VehicleShape()
+    ego: EgoController = EgoController()
+    claim: Claim = Claim()
+    episode: EpisodeRules = EpisodeRules()
+
+
+@dataclass(frozen=True)
+class VaeSettings:
+    """The paper's trait network and its training."""
+
+    embedding_sizes: tuple[int, ...] = (32, 64)  # code
+    hidden_size: int = 256  # code
+    encoder_output_size: int = 256  # code
+    decoder_output_size: int = 128  # code
+    kl_weight: float = 5e-8  # paper IV-B; the code has 5e-7
+    reconstruction_weight: float = 10.0  # code
+    learning_rate: float = 5e-4  # decays linearly to zero (paper IV-B)
+    weight_decay: float = 1e-6  # code
+    batch_size: int = 1024  # code
+    epochs: int = 1000  # paper IV-B
+
+
+@dataclass(frozen=True)
+class PolicySettings:
+    """The paper's policy network."""
+
+    embedding_sizes: tuple[int, ...] = (150, 100)  # code
+    score_sizes: tuple[int, ...] = (100, 100)  # code
+    context_size: int = 50  # code
+    joint_sizes: tuple[int, ...] = (150, 100, 64)  # code
+    hidden_size: int = 256  # code
+    head_sizes: tuple[int, ...] = (256, 256)  # code
+
+
+@dataclass(frozen=True)
+class PpoSettings:
+    """PPO as in the paper (IV-C) and its code; ``n_steps`` and ``n_envs`` set the batch."""
+
+    n_envs: int = 12  # paper
+    n_steps: int = 30  # paper
+    n_epochs: int = 5
+    n_minibatches: int = 2
+    learning_rate: float = 1e-4  # decays linearly to zero (paper)
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    ent_coef: float = 0.01
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+    total_steps: int = 10_000_000  # paper
+    policy: PolicySettings = field(default_factory=PolicySettings)

@@ -1,0 +1,83 @@
+"""Files that are whole or absent, folders that belong to one run, and the data files the package ships."""
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tint_sumo.errors import InputError
+
+RUN_FILE = "run.json"
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def shipped(name: str) -> Path:
+    """Path of a shipped folder, ``"sumo_net"`` or ``"models"``, in an installed wheel or in a checkout."""
+    installed = _PACKAGE / "shipped" / name
+    if installed.is_dir():
+        return installed
+    return _PACKAGE.parent / ("data/models" if name == "models" else name)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``; rename it to ``path`` only if the block succeeds."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    with whole_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def read_json(path: Path, what: str) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: the file is missing or damaged; ``what`` names its role in the message.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{what}: no file {path}; check the path") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{what}: {path} is damaged or unreadable ({error}); make it anew") from None
+    if not isinstance(value, dict):
+        raise InputError(f"{what}: {path} is damaged (not a JSON object); make it anew")
+    return value
+
+
+def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Make ``folder`` the home of the run described by ``settings``, or resume that very run.
+
+    Raises:
+        InputError: the folder holds another run, or files of unknown origin.
+    """
+    wanted = json.loads(json.dumps(settings))
+    run_file = folder / RUN_FILE
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file, not a folder; choose another --out")
+    if run_file.exists():
+        held = read_json(run_file, "run settings")
+        if held != wanted:
+            changed = sorted(key for key in held.keys() | wanted.keys() if held.get(key) != wanted.get(key))
+            raise InputError(
+                f"{folder} already holds another run (different: {', '.join(changed)}); "
+                "choose another --out or remove the folder"
+            )
+    elif folder.exists() and any(entry.suffix != ".partial" for entry in folder.iterdir()):
+        raise InputError(f"{folder} already holds other files; choose another --out or an empty folder")
+    else:
+        write_json(run_file, wanted)

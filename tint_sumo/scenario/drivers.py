@@ -1,0 +1,72 @@
+"""Driver vTypes: several IDM members per trait, and the vTypeDistribution plain SUMO draws from.
+
+Source: https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_Types,_and_Routes.html
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tint_sumo.config import DRIVER_PROFILES, DriverProfile, Idm, Population, VehicleShape
+
+DISTRIBUTION_ID = "drivers"
+EGO_TYPE = "ego"
+
+
+@dataclass(frozen=True)
+class DriverMember:
+    """One vType."""
+
+    type_id: str
+    profile: DriverProfile
+    desired_speed_mps: float
+    min_gap_m: float
+    idm: Idm
+
+
+def members(population: Population) -> tuple[DriverMember, ...]:
+    """All vTypes of a population, profile by profile, ``population.members`` each."""
+    rng = np.random.default_rng(population.seed)
+    return tuple(
+        DriverMember(
+            type_id=f"{profile.name}.{index}",
+            profile=profile,
+            desired_speed_mps=profile.desired_speed_mps,
+            min_gap_m=round(float(rng.uniform(*profile.min_gap_m)), 4),
+            idm=population.idm,
+        )
+        for profile in DRIVER_PROFILES
+        for index in range(population.members)
+    )
+
+
+def vtypes_xml(population: Population, p_conservative: float, vehicle: VehicleShape) -> str:
+    """SUMO additional file with every vType, the distribution with P(conservative) and the ego's type."""
+    drivers = members(population)
+    weight = {True: p_conservative, False: 1.0 - p_conservative}
+    probabilities = [weight[member.profile.yields] / population.members for member in drivers]
+    # SUMO cuts the corners off a passenger car's shape before it looks for collisions; a van keeps its full box.
+    shape = f'guiShape="delivery" length="{vehicle.length_m:g}" width="{vehicle.width_m:g}"'
+    lines = [
+        "<additional>",
+        *(f"    {_vtype(member, shape)}" for member in drivers),
+        f'    <vTypeDistribution id="{DISTRIBUTION_ID}" vTypes="{" ".join(member.type_id for member in drivers)}"',
+        f'        probabilities="{" ".join(f"{p:g}" for p in probabilities)}"/>',
+        f'    <vType id="{EGO_TYPE}" {shape} minGap="0" maxSpeed="10" speedDev="0" color="230,180,0"/>',
+        "</additional>",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _vtype(member: DriverMember, shape: str) -> str:
+    idm = member.idm
+    # A driver that does not yield ignores every vehicle on the junction; the rest of the trait, ignoring the ego as a
+    # leader, has no effect as a vType parameter and is set per vehicle.
+    ignore = "" if member.profile.yields else ' jmIgnoreJunctionFoeProb="1"'
+    return (
+        f'<vType id="{member.type_id}" carFollowModel="IDM" {shape} maxSpeed="{member.desired_speed_mps:g}" '
+        f'minGap="{member.min_gap_m:g}" accel="{idm.accel_mps2:g}" decel="{idm.decel_mps2:g}" '
+        f'emergencyDecel="{idm.emergency_decel_mps2:g}" tau="{idm.tau_s:g}" delta="{idm.delta:g}" '
+        f'speedFactor="1" speedDev="0" color="{member.profile.colour}"{ignore}/>'
+    )

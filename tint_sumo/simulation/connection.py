@@ -1,0 +1,73 @@
+"""One way to talk to SUMO: ``libsumo`` in this process, or ``traci`` to a ``sumo`` subprocess.
+
+libsumo holds one simulation per process, so a second environment in the same process (Stable-Baselines3's
+``EvalCallback`` has one) gets a subprocess.
+"""
+
+import contextlib
+import io
+import os
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import libsumo
+import traci
+from sumolib.miscutils import getFreeSocketPort
+
+from tint_sumo.config import Backend
+from tint_sumo.errors import InputError
+from tint_sumo.scenario.network import sumo_program
+
+_CONNECT_TRIES, _CONNECT_WAIT_S = 600, 0.05  # sumo takes a moment to listen
+_libsumo_owner: list[int] = []  # process id of the one libsumo simulation; a forked child does not inherit the claim
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A running simulation. ``vehicle`` and ``simulation`` are SUMO's TraCI domains."""
+
+    backend: Literal["libsumo", "traci"]
+    vehicle: Any
+    simulation: Any
+    step: Callable[[], Any]
+    close: Callable[[], None]
+
+
+def connect(options: Sequence[str], backend: Backend = "auto") -> Connection:
+    """Start SUMO with command-line ``options`` (https://sumo.dlr.de/docs/sumo.html).
+
+    ``auto`` takes libsumo if it is free in this process and traci otherwise.
+
+    Raises:
+        InputError: libsumo was asked for but already runs a simulation in this process, or the name is unknown.
+    """
+    if backend not in ("auto", "libsumo", "traci"):
+        raise InputError(f"unknown backend {backend!r}; choose auto, libsumo or traci")
+    busy = os.getpid() in _libsumo_owner
+    if backend == "libsumo" and busy:
+        raise InputError("libsumo already runs a simulation in this process; close it first or use backend='traci'")
+    return _traci(options) if backend == "traci" or busy else _libsumo(options)
+
+
+def _libsumo(options: Sequence[str]) -> Connection:
+    libsumo.start(["sumo", *options])
+    _libsumo_owner[:] = [os.getpid()]
+
+    def close() -> None:
+        if os.getpid() in _libsumo_owner:
+            _libsumo_owner.clear()
+            libsumo.close()
+
+    return Connection("libsumo", libsumo.vehicle, libsumo.simulation, libsumo.simulationStep, close)
+
+
+def _traci(options: Sequence[str]) -> Connection:
+    port = getFreeSocketPort()
+    command = [sumo_program("sumo"), *options, "--remote-port", str(port)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    with contextlib.redirect_stdout(io.StringIO()):  # traci prints every try
+        connection = traci.connect(port, numRetries=_CONNECT_TRIES, proc=process, waitBetweenRetries=_CONNECT_WAIT_S)
+    # Closing tells sumo to end and waits for it.
+    return Connection("traci", connection.vehicle, connection.simulation, connection.simulationStep, connection.close)

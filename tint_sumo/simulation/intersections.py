@@ -1,0 +1,385 @@
+"""Many intersections in one SUMO simulation.
+
+Each replica is an intersection of its own, far from the others in the same network; its episode depends on its seed
+alone, not on the batch it runs in. State is kept in arrays, (R,) for egos and (R, 12) for vehicle slots; the only
+per-vehicle call into SUMO each step reads its lane position.
+"""
+
+import tempfile
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tint_sumo.config import MAX_VEHICLES, Backend, Scenario
+from tint_sumo.errors import InputError
+from tint_sumo.scenario.build import DRIVERS_FILE, NET_FILE, ROUTES_FILE, scenario_files
+from tint_sumo.scenario.drivers import EGO_TYPE, members
+from tint_sumo.scenario.network import EGO_ROUTE, lane_id, name
+from tint_sumo.simulation import ego as ego_control
+from tint_sumo.simulation.connection import Connection, connect
+from tint_sumo.simulation.geometry import (
+    LANE_NAMES,
+    LOWER,
+    UPPER,
+    Bools,
+    EgoPath,
+    Floats,
+    Pose,
+    box_distance_m,
+    centre_x_m,
+    lane_length_m,
+    lane_y_m,
+)
+from tint_sumo.simulation.traffic import DriverStream
+
+_EMPTY = -1
+_EGO_PREFIX = "ego"
+_SPEED_MODE_OBEY_SETSPEED = 32  # all of SUMO's own checks off: the ego drives exactly the speed it is given
+_IGNORE_ON_JUNCTION = "junctionModel.ignoreTypes"
+_IGNORE_AS_LEADER = "carFollowModel.ignoreTypes"
+
+
+@dataclass(frozen=True)
+class Collision:
+    """The ego's first collision in an episode."""
+
+    slot: int  # of the other vehicle
+    profile: str  # its driver's trait
+    lane: str  # its lane
+    ego_x_m: float  # the ego's centre
+    ego_y_m: float
+
+
+@dataclass(frozen=True)
+class PlacedVehicle:
+    """A vehicle of a scene, driving at its driver's desired speed."""
+
+    lane: int  # 0 lower, 1 upper
+    front_m: float  # front bumper's distance along the lane, 5 at the entry and 45 at the exit
+    member: int  # index into the population
+
+
+def _sumo_options(folder: Path, step_s: float) -> list[str]:
+    return [
+        *("--net-file", str(folder / NET_FILE)),
+        *("--additional-files", f"{folder / DRIVERS_FILE},{folder / ROUTES_FILE}"),
+        *("--step-length", str(step_s)),
+        *("--collision.action", "warn"),
+        *("--collision.check-junctions", "true"),
+        *("--collision.mingap-factor", "0"),
+        *("--time-to-teleport", "-1"),
+        *("--no-step-log", "true"),
+        *("--no-warnings", "true"),
+        *("--seed", "0"),
+    ]
+
+
+def _start(replicas: int, scenario: Scenario, backend: Backend) -> Connection:
+    with tempfile.TemporaryDirectory(prefix="tint_sumo.") as folder:
+        for file, text in scenario_files(replicas, scenario).items():
+            (Path(folder) / file).write_text(text, encoding="utf-8")
+        return connect(_sumo_options(Path(folder), scenario.episode.step_s), backend)
+
+
+class Intersections:
+    """A batch of ``replicas`` intersections, each empty until its first :meth:`reset`.
+
+    Read-only state, all arrays of this batch (do not write to them):
+
+    ================= ======== ===============================================================
+    ``present``       (R, 12)  which slots hold a vehicle
+    ``lane``          (R, 12)  0 lower (west), 1 upper (east)
+    ``front_m``       (R, 12)  front bumper's distance along the lane
+    ``member``        (R, 12)  index into :attr:`population`, -1 in empty slots
+    ``vehicle_number`` (R, 12) running number of the vehicle in its replica's episode
+    ``x_m``, ``y_m``  (R, 12)  vehicle centres
+    ``ego_front_m``   (R,)     front bumper's distance along the ego's path
+    ``ego_speed_mps`` (R,)
+    ``time_s``        (R,)     since the episode's start
+    ================= ======== ===============================================================
+
+    A vehicle keeps its slot while it is on the street, and a slot stays empty for at least one step between two
+    vehicles. At most 12 vehicles are on a street; further ones wait outside.
+    """
+
+    def __init__(
+        self, replicas: int, scenario: Scenario | None = None, *, with_ego: bool = True, backend: Backend = "auto"
+    ) -> None:
+        self.scenario = scenario = scenario or Scenario()
+        self.replicas = replicas
+        self.population = members(scenario.population)
+        self.path = EgoPath(scenario.street, scenario.vehicle)
+        self._with_ego = with_ego
+        self._yields = np.array([member.profile.yields for member in self.population])
+        self._lane_length_m = lane_length_m(scenario.street, scenario.vehicle)
+        half = scenario.street.junction_half_length_m
+        before = self._lane_length_m / 2 - half
+        self._stage_start_m = np.array([0.0, before, before + 2 * half])
+
+        slots = (replicas, MAX_VEHICLES)
+        self.present: Bools = np.zeros(slots, bool)
+        self.lane = np.zeros(slots, np.int64)
+        self.front_m: Floats = np.zeros(slots)
+        self.member = np.full(slots, _EMPTY)
+        self.vehicle_number = np.full(slots, _EMPTY)
+        self.x_m: Floats = np.zeros(slots)
+        self.y_m: Floats = np.zeros(slots)
+        self.ego_front_m: Floats = np.zeros(replicas)
+        self.ego_speed_mps: Floats = np.zeros(replicas)
+        self.time_s: Floats = np.zeros(replicas)
+        self.collision: list[Collision | None] = [None] * replicas
+        self._stage = np.zeros(slots, np.int64)  # which of its lane's three SUMO lanes a vehicle is on
+        self._lane_pos_m: Floats = np.zeros(slots)
+        self._was_present: Bools = np.zeros(slots, bool)  # at the previous step; such a slot takes no new vehicle yet
+        self._distance_m: Floats = np.full(slots, np.inf)
+        self._closing_mps: Floats = np.zeros(slots)
+        self._claims: Bools = np.zeros((replicas, 2), bool)
+        self._ids: list[list[str]] = [[""] * MAX_VEHICLES for _ in range(replicas)]
+        self._slot_of: dict[str, tuple[int, int]] = {}
+        self._ego_ids = [""] * replicas
+        self._episodes = [0] * replicas
+        self._vehicle_count = [0] * replicas
+        self._streams: list[tuple[DriverStream, ...]] = [() for _ in range(replicas)]
+        self._wanted_gap_m: Floats = np.full((replicas, 2), np.inf)
+        self._wanted_time_s: Floats = np.zeros((replicas, 2))
+
+        self._connection = _start(replicas, scenario, backend)
+        self._finalizer = weakref.finalize(self, self._connection.close)
+
+    @property
+    def backend(self) -> str:
+        return self._connection.backend
+
+    @property
+    def yields(self) -> Bools:
+        """Which slots hold a yielding (conservative) driver; (R, 12)."""
+        return np.asarray(self.present & self._yields[self.member])
+
+    @property
+    def has_claimed(self) -> Bools:
+        """Which lanes (lower, upper) the ego claims now; (R, 2)."""
+        return self._claims
+
+    def ego_pose(self) -> Pose:
+        return self.path.pose(self.ego_front_m)
+
+    def close(self) -> None:
+        """End the simulation; safe to call twice."""
+        self._finalizer()
+
+    # Episodes
+
+    def reset(self, replica: int, seed: int | Sequence[int] | np.random.SeedSequence) -> None:
+        """Empty a replica and start a new random episode in it."""
+        sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+        streams = tuple(
+            DriverStream(np.random.default_rng(child), self.population, self.scenario) for child in sequence.spawn(2)
+        )
+        placed = [
+            PlacedVehicle(lane, front_m, driver.member)
+            for lane, stream in enumerate(streams)
+            for driver, front_m in stream.placement()
+        ]
+        self.reset_to(replica, placed)
+        self._streams[replica] = streams
+        for lane in (LOWER, UPPER):
+            self._expect(replica, lane)
+
+    def reset_to(self, replica: int, vehicles: Sequence[PlacedVehicle]) -> None:
+        """Empty a replica and start an episode with exactly these vehicles; nobody else enters.
+
+        Raises:
+            InputError: more than 12 vehicles.
+        """
+        if len(vehicles) > MAX_VEHICLES:
+            raise InputError(f"at most {MAX_VEHICLES} vehicles fit a scene, not {len(vehicles)}")
+        self.clear(replica)
+        self._episodes[replica] += 1
+        self._vehicle_count[replica] = 0
+        self.time_s[replica] = 0.0
+        self.collision[replica] = None
+        self._claims[replica] = False
+        for slot, vehicle in enumerate(vehicles):
+            self._add(replica, slot, vehicle)
+        if self._with_ego:
+            self._add_ego(replica)
+        self._locate(np.array([replica]), started=True)
+
+    def clear(self, replica: int) -> None:
+        """Empty a replica and leave it so, at next to no cost, until its next reset."""
+        vehicle = self._connection.vehicle
+        for slot in np.flatnonzero(self.present[replica]):
+            vehicle.remove(self._ids[replica][slot])
+            self._forget(replica, int(slot))
+        if self._ego_ids[replica]:
+            vehicle.remove(self._ego_ids[replica])
+            self._ego_ids[replica] = ""
+        self._was_present[replica] = False
+        self._wanted_gap_m[replica] = np.inf
+
+    def _add_ego(self, replica: int) -> None:
+        ego_id = f"{_EGO_PREFIX}.{replica}.{self._episodes[replica]}"
+        front_m = self.path.start_m(self.scenario.episode.ego_start_y_m)
+        vehicle = self._connection.vehicle
+        vehicle.add(ego_id, name("ego", replica), typeID=EGO_TYPE, departPos=str(front_m), departSpeed="0")
+        vehicle.moveTo(ego_id, f"{name(EGO_ROUTE[0], replica)}_0", front_m)
+        vehicle.setSpeedMode(ego_id, _SPEED_MODE_OBEY_SETSPEED)
+        vehicle.setSpeed(ego_id, 0.0)
+        self._ego_ids[replica] = ego_id
+        self.ego_front_m[replica] = front_m
+        self.ego_speed_mps[replica] = 0.0
+
+    def _add(self, replica: int, slot: int, placed: PlacedVehicle) -> None:
+        lane, member = placed.lane, self.population[placed.member]
+        number = self._vehicle_count[replica]
+        self._vehicle_count[replica] += 1
+        vehicle_id = f"{replica}.{self._episodes[replica]}.{number}"
+        stage = int(np.searchsorted(self._stage_start_m, placed.front_m, side="right")) - 1
+        position_m = placed.front_m - self._stage_start_m[stage]
+        vehicle = self._connection.vehicle
+        vehicle.add(
+            vehicle_id,
+            name(LANE_NAMES[lane], replica),
+            typeID=member.type_id,
+            departPos="base",
+            departSpeed=str(member.desired_speed_mps),
+        )
+        vehicle.moveTo(vehicle_id, lane_id(lane, stage, replica), position_m)
+        if not member.profile.yields:
+            vehicle.setParameter(vehicle_id, _IGNORE_AS_LEADER, EGO_TYPE)
+        vehicle.setParameter(vehicle_id, _IGNORE_ON_JUNCTION, EGO_TYPE)
+        if member.profile.yields and self._claims[replica, lane]:
+            self._set_yielding(vehicle_id, placed.member, True)
+        self._ids[replica][slot] = vehicle_id
+        self._slot_of[vehicle_id] = (replica, slot)
+        self.present[replica, slot] = True
+        self.lane[replica, slot] = lane
+        self.member[replica, slot] = placed.member
+        self.vehicle_number[replica, slot] = number
+        self._stage[replica, slot] = stage
+        self._lane_pos_m[replica, slot] = position_m
+
+    def _forget(self, replica: int, slot: int) -> None:
+        del self._slot_of[self._ids[replica][slot]]
+        self._ids[replica][slot] = ""
+        self.present[replica, slot] = False
+        self.member[replica, slot] = _EMPTY
+        self.vehicle_number[replica, slot] = _EMPTY
+
+    # Steps
+
+    def step(self, desired_speed_mps: Floats | None = None) -> None:
+        """Advance all replicas by one step; (R,) desired speeds of the egos, none without egos."""
+        if desired_speed_mps is not None:
+            self._drive_egos(desired_speed_mps)
+        self._was_present[:] = self.present
+        self._connection.step()
+        self.time_s += self.scenario.episode.step_s
+        for vehicle_id in self._connection.simulation.getArrivedIDList():
+            if vehicle_id in self._slot_of:
+                self._forget(*self._slot_of[vehicle_id])
+            elif vehicle_id in self._ego_ids:
+                self._ego_ids[self._ego_ids.index(vehicle_id)] = ""
+        self._read_positions()
+        self._admit()
+        self._locate(slice(None))
+        if self._with_ego:
+            self._latch_collisions()
+
+    def _drive_egos(self, desired_speed_mps: Floats) -> None:
+        controller, step_s = self.scenario.ego, self.scenario.episode.step_s
+        self._update_claims()
+        unsafe = ego_control.is_unsafe(self._distance_m, self._closing_mps, controller)
+        accel = ego_control.acceleration_mps2(self.ego_speed_mps, desired_speed_mps, unsafe, controller)
+        self.ego_speed_mps = np.maximum(self.ego_speed_mps + accel * step_s, 0.0)
+        self.ego_front_m = self.ego_front_m + self.ego_speed_mps * step_s
+        set_speed = self._connection.vehicle.setSpeed
+        for ego_id, speed_mps in zip(self._ego_ids, self.ego_speed_mps.tolist(), strict=True):
+            if ego_id:
+                set_speed(ego_id, speed_mps)
+
+    def _update_claims(self) -> None:
+        _, front_y_m = self.path.point(self.ego_front_m)
+        towards_mps = self.ego_speed_mps * self.path.direction_y(self.ego_front_m)
+        now = ego_control.claims(front_y_m, towards_mps, self.scenario.claim, self.scenario.street)
+        for replica, lane in np.argwhere(now != self._claims).tolist():
+            for slot in np.flatnonzero(self.yields[replica] & (self.lane[replica] == lane)):
+                self._set_yielding(self._ids[replica][slot], self.member[replica, slot], bool(now[replica, lane]))
+        self._claims = now
+
+    def _set_yielding(self, vehicle_id: str, member: int, yielding: bool) -> None:
+        vehicle = self._connection.vehicle
+        vehicle.setParameter(vehicle_id, _IGNORE_ON_JUNCTION, "" if yielding else EGO_TYPE)
+        courtesy_m = self.scenario.claim.courtesy_gap_m if yielding else 0.0
+        vehicle.setMinGap(vehicle_id, self.population[member].min_gap_m + courtesy_m)
+
+    def _read_positions(self) -> None:
+        where = np.nonzero(self.present)
+        ids = [self._ids[replica][slot] for replica, slot in zip(*(axis.tolist() for axis in where), strict=True)]
+        position_m = np.fromiter(map(self._connection.vehicle.getLanePosition, ids), float, len(ids))
+        # Vehicles only move forward: a lane position that dropped belongs to the next SUMO lane.
+        self._stage[where] += position_m < self._lane_pos_m[where]
+        self._lane_pos_m[where] = position_m
+
+    def _admit(self) -> None:
+        """Let the upcoming drivers in where there is room, a free slot, and their time has come."""
+        front_m = self._stage_start_m[self._stage] + self._lane_pos_m
+        entry_m = self.scenario.vehicle.length_m
+        last_m = np.stack(
+            [np.where(self.present & (self.lane == lane), front_m, np.inf).min(axis=1) for lane in (LOWER, UPPER)],
+            axis=1,
+        )
+        # A lane without vehicles has room; a replica without an episode wants an infinite gap.
+        room = np.minimum(last_m - self.scenario.vehicle.length_m - entry_m, 1e9) >= self._wanted_gap_m
+        for replica, lane in np.argwhere(room & (self.time_s[:, None] >= self._wanted_time_s)).tolist():
+            free = np.flatnonzero(~(self.present[replica] | self._was_present[replica]))
+            if len(free):
+                driver = self._streams[replica][lane].take()
+                self._add(replica, int(free[0]), PlacedVehicle(lane, entry_m, driver.member))
+                self._expect(replica, lane)
+
+    def _expect(self, replica: int, lane: int) -> None:
+        upcoming = self._streams[replica][lane].upcoming
+        self._wanted_gap_m[replica, lane] = upcoming.gap_m
+        self._wanted_time_s[replica, lane] = self.time_s[replica] + upcoming.wait_s
+
+    def _locate(self, rows: slice | NDArray[np.int64], started: bool = False) -> None:
+        """Derive coordinates, and distances from the ego, of the given replicas."""
+        street, shape = self.scenario.street, self.scenario.vehicle
+        lane, present = self.lane[rows], self.present[rows]
+        self.front_m[rows] = self._stage_start_m[self._stage[rows]] + self._lane_pos_m[rows]
+        self.x_m[rows] = centre_x_m(self.front_m[rows], lane, street, shape)
+        self.y_m[rows] = lane_y_m(street)[lane]
+        if not self._with_ego:
+            return
+        pose = self.path.pose(self.ego_front_m[rows])
+        distance_m = np.where(present, box_distance_m(pose, self.x_m[rows], self.y_m[rows], shape), np.inf)
+        if started:
+            self._closing_mps[rows] = 0.0
+        else:
+            known = np.isfinite(self._distance_m[rows]) & np.isfinite(distance_m)
+            change = np.subtract(self._distance_m[rows], distance_m, out=np.zeros_like(distance_m), where=known)
+            self._closing_mps[rows] = change / self.scenario.episode.step_s
+        self._distance_m[rows] = distance_m
+
+    def _latch_collisions(self) -> None:
+        for event in self._connection.simulation.getCollisions():
+            pair = (event.collider, event.victim)
+            ego_id = next((one for one in pair if one.startswith(_EGO_PREFIX)), None)
+            other = next((one for one in pair if one in self._slot_of), None)
+            if ego_id is None or other is None:
+                continue
+            replica, slot = self._slot_of[other]
+            if self.collision[replica] is None and self._ego_ids[replica] == ego_id:
+                pose = self.path.pose(self.ego_front_m[replica : replica + 1])
+                self.collision[replica] = Collision(
+                    slot,
+                    self.population[self.member[replica, slot]].profile.name,
+                    LANE_NAMES[self.lane[replica, slot]],
+                    float(pose.x_m[0]),
+                    float(pose.y_m[0]),
+                )

@@ -1,0 +1,58 @@
+"""Who drives on the street and where they appear: draws from a lane's own generator."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from tint_sumo.config import Scenario
+from tint_sumo.scenario.drivers import DriverMember
+from tint_sumo.simulation.geometry import lane_length_m
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A driver about to appear."""
+
+    member: int  # index into the population's members
+    gap_m: float  # bumper gap to the vehicle ahead that it waits for
+    wait_s: float  # time since the driver before it; 0 in saturated traffic
+
+
+class DriverStream:
+    """The endless sequence of drivers on one lane; its k-th driver depends on the lane's seed alone."""
+
+    def __init__(self, rng: np.random.Generator, population: tuple[DriverMember, ...], scenario: Scenario) -> None:
+        self._rng = rng
+        self._population = population
+        self._scenario = scenario
+        self._by_trait = {
+            yields: [index for index, member in enumerate(population) if member.profile.yields is yields]
+            for yields in (True, False)
+        }
+        self.upcoming = self._draw()
+
+    def _draw(self) -> Driver:
+        rng, traffic = self._rng, self._scenario.traffic
+        candidates = self._by_trait[bool(rng.random() < traffic.p_conservative)]
+        member = candidates[int(rng.integers(len(candidates)))]
+        gap_m = rng.uniform(*self._population[member].profile.entry_gap_m)
+        wait_s = 0.0 if traffic.arrivals_per_s is None else rng.exponential(1.0 / traffic.arrivals_per_s)
+        return Driver(member, gap_m, wait_s)
+
+    def take(self) -> Driver:
+        """The upcoming driver, who is then followed by a new one."""
+        driver, self.upcoming = self.upcoming, self._draw()
+        return driver
+
+    def placement(self) -> Iterator[tuple[Driver, float]]:
+        """Fill the lane as an episode starts, from its exit to its entry: drivers and their ``front_m``."""
+        length_m = self._scenario.vehicle.length_m
+        mean_gap_m = float(np.mean([gap for member in self._population for gap in member.profile.entry_gap_m]))
+        end_m = lane_length_m(self._scenario.street, self._scenario.vehicle)
+        front_m = end_m - (length_m + mean_gap_m) * self._rng.random()
+        while front_m >= length_m:
+            yield self.take(), front_m
+            follower = self.upcoming
+            waited_m = follower.wait_s * self._population[follower.member].desired_speed_mps
+            front_m -= length_m + follower.gap_m + waited_m

@@ -1,0 +1,181 @@
+"""Episodes of the navigation task in a batch of intersections: what all environment classes share."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from tint_sumo.config import (
+    MAX_VEHICLES,
+    POSITION_SCALE_M,
+    REWARD_PRESETS,
+    SPEED_SCALE_MPS,
+    Backend,
+    EpisodeRules,
+    RewardPreset,
+    Scenario,
+    Traffic,
+)
+from tint_sumo.errors import InputError
+from tint_sumo.simulation.geometry import Bools, Floats, Pose
+from tint_sumo.simulation.intersections import Intersections
+
+Observation = dict[str, NDArray[np.float32]]
+
+_BOUND = 2.0  # of normalised observations: 40 m, 6 m/s
+_SEED_LIMIT = 2**63
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """The arguments of the environments' constructors."""
+
+    p_conservative: float = 0.4
+    reward: str = "paper"
+    time_limit_s: float = 50.0
+    position_noise_m: float = 0.0
+    backend: Backend = "auto"
+
+    def __post_init__(self) -> None:
+        if self.reward not in REWARD_PRESETS:
+            raise InputError(f"unknown reward preset {self.reward!r}; choose one of {', '.join(REWARD_PRESETS)}")
+        if not self.time_limit_s > 0.0:
+            raise InputError(f"time_limit_s must be positive, not {self.time_limit_s}")
+        if not self.position_noise_m >= 0.0:
+            raise InputError(
+                f"position_noise_m is a standard deviation and must not be negative: {self.position_noise_m}"
+            )
+
+    @property
+    def scenario(self) -> Scenario:
+        rules = replace(EpisodeRules(), time_limit_s=self.time_limit_s)
+        return Scenario(traffic=Traffic(p_conservative=self.p_conservative), episode=rules)
+
+
+def observation_space() -> spaces.Dict:
+    return spaces.Dict(
+        {
+            "ego": spaces.Box(-_BOUND, _BOUND, (4,), np.float32),
+            "vehicles": spaces.Box(-_BOUND, _BOUND, (MAX_VEHICLES, 2), np.float32),
+            "mask": spaces.Box(0.0, 1.0, (MAX_VEHICLES,), np.float32),
+        }
+    )
+
+
+@dataclass(frozen=True)
+class Transition:
+    """What one step brought each environment; arrays (N,)."""
+
+    reward: Floats
+    reward_terms: dict[str, Floats]
+    success: Bools
+    collision: Bools
+    timeout: Bools
+
+    @property
+    def terminated(self) -> Bools:
+        return self.success | self.collision
+
+    @property
+    def done(self) -> Bools:
+        return self.terminated | self.timeout
+
+    @property
+    def outcome(self) -> NDArray[np.str_]:
+        """``success``, ``collision``, ``timeout`` or the empty string."""
+        ends = [self.success, self.collision, self.timeout]
+        return np.select(ends, ["success", "collision", "timeout"], "")
+
+
+def reward_terms(speed_mps: Floats, success: Bools, collision: Bools, preset: RewardPreset) -> dict[str, Floats]:
+    """The named terms whose sum is the reward (paper IV-A); (N,) each."""
+    driving = ~(success | collision)
+    return {
+        "goal": preset.goal * success,
+        "collision": preset.collision * collision,
+        "speed": preset.speed_weight_per_mps * speed_mps * driving,
+        "step": preset.step * driving,
+    }
+
+
+def has_reached_goal(pose: Pose, scenario: Scenario) -> Bools:
+    """Whether the ego's centre is past the goal and within a metre of the upper lane's middle."""
+    off_centre_m = np.abs(pose.y_m - scenario.street.upper_y_m)
+    return np.asarray((pose.x_m > scenario.episode.goal_x_m) & (off_centre_m < scenario.street.lane_width_m / 4))
+
+
+class Episodes:
+    """``num_envs`` episodes at a time, each in its own replica with its own random stream."""
+
+    def __init__(self, num_envs: int, settings: TaskSettings) -> None:
+        self.settings = settings
+        self.simulation = Intersections(num_envs, settings.scenario, backend=settings.backend)
+        self._preset = REWARD_PRESETS[settings.reward]
+        self._speeds_mps = np.array(self.simulation.scenario.ego.desired_speeds_mps)
+        self._step_limit = round(settings.time_limit_s / self.simulation.scenario.episode.step_s)
+        self.steps = np.zeros(num_envs, np.int64)
+        self._noise = [np.random.default_rng(0) for _ in range(num_envs)]
+        self._measured_noise_m: Floats = np.zeros((num_envs, MAX_VEHICLES, 2))
+
+    def begin(self, index: int, rng: np.random.Generator) -> None:
+        """Start a new episode drawn from an environment's generator."""
+        seed = int(rng.integers(_SEED_LIMIT))
+        self.simulation.reset(index, seed)
+        self.steps[index] = 0
+        self._noise[index] = np.random.default_rng([seed, 1])
+        self._measure(index)
+
+    def step(self, actions: NDArray[np.integer]) -> Transition:
+        simulation = self.simulation
+        simulation.step(self._speeds_mps[actions])
+        self.steps += 1
+        for index in range(len(self.steps)):
+            self._measure(index)
+        collision = np.array([event is not None for event in simulation.collision])
+        success = has_reached_goal(simulation.ego_pose(), simulation.scenario) & ~collision
+        timeout = (self.steps >= self._step_limit) & ~(success | collision)
+        terms = reward_terms(simulation.ego_speed_mps, success, collision, self._preset)
+        return Transition(np.sum(list(terms.values()), axis=0), terms, success, collision, timeout)
+
+    def _measure(self, index: int) -> None:
+        """Draw the noise of this step's position measurements."""
+        sigma_m = self.settings.position_noise_m
+        if sigma_m > 0.0:
+            self._measured_noise_m[index] = self._noise[index].normal(0.0, sigma_m, (MAX_VEHICLES, 2))
+
+    def observe(self) -> Observation:
+        """Observations of all environments, batched along the first axis."""
+        simulation = self.simulation
+        pose = simulation.ego_pose()
+        speed = simulation.ego_speed_mps / SPEED_SCALE_MPS
+        ego = np.stack(
+            [
+                pose.x_m / POSITION_SCALE_M,
+                pose.y_m / POSITION_SCALE_M,
+                speed * pose.heading_x,
+                speed * pose.heading_y,
+            ],
+            axis=1,
+        )
+        relative = np.stack([simulation.x_m - pose.x_m[:, None], simulation.y_m - pose.y_m[:, None]], axis=2)
+        relative += self._measured_noise_m
+        relative *= simulation.present[:, :, None] / POSITION_SCALE_M
+        return {
+            "ego": np.clip(ego, -_BOUND, _BOUND).astype(np.float32),
+            "vehicles": np.clip(relative, -_BOUND, _BOUND).astype(np.float32),
+            "mask": simulation.present.astype(np.float32),
+        }
+
+    def traits(self) -> NDArray[np.int8]:
+        """True traits, (N, 12): 1 conservative, -1 aggressive, 0 in empty slots."""
+        present = self.simulation.present.astype(np.int8)
+        return np.where(self.simulation.yields, present, -present).astype(np.int8)
+
+    def collision_info(self, index: int) -> dict[str, Any]:
+        """Who was hit where; empty without a collision."""
+        event = self.simulation.collision[index]
+        if event is None:
+            return {}
+        return {"trait": event.profile, "lane": event.lane, "slot": event.slot, "ego_m": (event.ego_x_m, event.ego_y_m)}

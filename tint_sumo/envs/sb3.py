@@ -1,0 +1,73 @@
+"""The vector environment as Stable-Baselines3 wants it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from tint_sumo.envs.vector import TIntersectionVectorEnv
+
+
+class TIntersectionVecEnv(VecEnv):
+    """Stable-Baselines3 ``VecEnv`` of ``num_envs`` intersections in one simulation.
+
+    Takes the arguments of :class:`~tint_sumo.envs.t_intersection.TIntersectionEnv`. ``infos[i]`` holds ``traits``, the
+    true traits that go with the returned observation; when an episode ends also ``terminal_observation``,
+    ``TimeLimit.truncated``, ``terminal_traits``, ``outcome``, ``time_s`` and, after a collision, ``collision``.
+    """
+
+    def __init__(self, num_envs: int, seed: int | None = None, **settings: Any) -> None:
+        self.env = TIntersectionVectorEnv(num_envs, **settings)
+        super().__init__(num_envs, self.env.single_observation_space, self.env.single_action_space)
+        self._actions: NDArray[np.int64] = np.zeros(num_envs, np.int64)
+        if seed is not None:
+            self.seed(seed)
+
+    def reset(self) -> VecEnvObs:
+        seeds = None if all(seed is None for seed in self._seeds) else self._seeds
+        observation, infos = self.env.reset(seed=seeds)
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{"traits": traits} for traits in infos["traits"]]
+        return observation  # type: ignore[return-value]
+
+    def step_async(self, actions: NDArray[np.int64]) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        observation, reward, terminated, truncated, infos = self.env.step(self._actions)
+        done = terminated | truncated
+        listed: list[dict[str, Any]] = [{"traits": traits, "outcome": ""} for traits in infos["traits"]]
+        for index in np.flatnonzero(done).tolist():
+            final = infos["final_info"]
+            listed[index] |= {
+                "terminal_observation": infos["final_obs"][index],
+                "TimeLimit.truncated": bool(truncated[index]),
+                "terminal_traits": final["traits"][index],
+                "outcome": str(final["outcome"][index]),
+                "time_s": float(final["time_s"][index]),
+            }
+            if final["_collision"][index]:
+                listed[index]["collision"] = final["collision"][index]
+        return observation, reward.astype(np.float32), done, listed  # type: ignore[return-value]
+
+    def close(self) -> None:
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        raise NotImplementedError("the intersections share one simulation; give settings to the constructor")
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        raise NotImplementedError("the intersections share one simulation and have no methods of their own")
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        return self.env.render() or [None] * self.num_envs

@@ -1,0 +1,136 @@
+"""The single environment."""
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from tint_sumo.config import Backend
+from tint_sumo.envs.episodes import Episodes, Observation, TaskSettings, observation_space
+from tint_sumo.envs.rendering import RENDER_FPS, render_intersection, require_render_mode
+
+
+class TIntersectionEnv(gymnasium.Env[Observation, np.int64]):
+    """Turn right across one lane and merge into the other, among drivers whose traits are unknown.
+
+    ## Description
+    An uncontrolled T-intersection with left-hand traffic (Liu et al., ICRA 2022), simulated by Eclipse SUMO. The ego
+    comes up the stem, crosses the lower lane (westbound) and merges into the upper lane (eastbound). Conservative
+    drivers yield to an ego that moves into their lane; aggressive drivers do not and hit it. The ego's path is fixed;
+    the agent chooses its desired speed, which a PD controller follows and a safety check can override.
+
+    ## Action Space
+    `Discrete(3)`: desired speed 0, 0.5 or 3 m/s.
+
+    ## Observation Space
+    A `Dict` of float32 arrays, lengths divided by 20 m, speeds by 3 m/s, clipped to [-2, 2]:
+
+    | Key        | Shape     | Content                                                                          |
+    |------------|-----------|----------------------------------------------------------------------------------|
+    | `ego`      | `(4,)`    | x, y, x velocity, y velocity of the ego's centre; origin where the stem meets the lower lane |
+    | `vehicles` | `(12, 2)` | x, y of each vehicle's centre relative to the ego's, with measurement noise; 0 in empty slots |
+    | `mask`     | `(12,)`   | 1 where the slot holds a vehicle                                                 |
+
+    A vehicle keeps its slot for as long as it is on the street; a slot stays empty for at least one step between two
+    vehicles. The others' velocities and traits are not observed.
+
+    ## Rewards
+    The sum of named terms, also found in `info["reward_terms"]`:
+
+    | Term        | Paper                             | `reward="authors"`                |
+    |-------------|-----------------------------------|-----------------------------------|
+    | `goal`      | 2.5 at the goal                   | 2.5                               |
+    | `collision` | -2 on collision                   | -2                                |
+    | `speed`     | 0.05 x ego speed (m/s) otherwise  | 0.05 / 3 x ego speed otherwise    |
+    | `step`      | -0.0013 otherwise                 | -0.013 otherwise                  |
+
+    ## Starting State
+    The ego stands with its centre at (0, -5). Both lanes are filled at random; each driver is conservative with
+    probability `p_conservative`.
+
+    ## Episode End
+    Termination: the ego's centre passes x = 8 m on the upper lane (`success`), or its box touches another vehicle's
+    (`collision`). Truncation: the time limit (`timeout`).
+
+    ## Information
+    | Key            | Content                                                                        |
+    |----------------|--------------------------------------------------------------------------------|
+    | `traits`       | `(12,)` int8, true traits: 1 conservative, -1 aggressive, 0 in empty slots     |
+    | `outcome`      | `"success"`, `"collision"`, `"timeout"`, or `""` while the episode goes on     |
+    | `reward_terms` | the reward's named terms (after a step)                                        |
+    | `time_s`       | time since the episode's start                                                 |
+    | `collision`    | after a collision: the other driver's `trait`, `lane`, `slot`, and `ego_m`     |
+
+    ## Arguments
+    * `p_conservative`: probability that a driver is conservative, in [0, 1]; default 0.4.
+    * `reward`: `"paper"` (default) or `"authors"` (the values of the authors' code).
+    * `time_limit_s`: default 50 s.
+    * `position_noise_m`: standard deviation of the noise on the others' x and y, independent per vehicle and step.
+    * `backend`: `"libsumo"`, `"traci"` (a sumo subprocess), or `"auto"` (default): libsumo if no other environment of
+      this process uses it, since libsumo holds one simulation per process.
+    * `render_mode`: `None` or `"rgb_array"`.
+
+    ## Version History
+    * v0: first release.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS}
+
+    def __init__(
+        self,
+        p_conservative: float = 0.4,
+        reward: str = "paper",
+        time_limit_s: float = 50.0,
+        position_noise_m: float = 0.0,
+        backend: Backend = "auto",
+        render_mode: str | None = None,
+    ) -> None:
+        require_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.observation_space = observation_space()
+        self._episodes = Episodes(1, TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, backend))
+        speeds_mps = self._episodes.simulation.scenario.ego.desired_speeds_mps
+        self.action_space = spaces.Discrete(len(speeds_mps))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._episodes.begin(0, self.np_random)
+        return self._observation(), self._info("")
+
+    def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        transition = self._episodes.step(np.array([action]))
+        info = self._info(str(transition.outcome[0]))
+        info["reward_terms"] = {term: float(value[0]) for term, value in transition.reward_terms.items()}
+        if transition.collision[0]:
+            info["collision"] = self._episodes.collision_info(0)
+        return (
+            self._observation(),
+            float(transition.reward[0]),
+            bool(transition.terminated[0]),
+            bool(transition.timeout[0]),
+            info,
+        )
+
+    def _observation(self) -> Observation:
+        return {key: value[0] for key, value in self._episodes.observe().items()}
+
+    def _info(self, outcome: str) -> dict[str, Any]:
+        step_s = self._episodes.simulation.scenario.episode.step_s
+        return {
+            "traits": self._episodes.traits()[0],
+            "outcome": outcome,
+            "time_s": float(self._episodes.steps[0] * step_s),
+        }
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """(H, W, 3) image of the intersection; conservative drivers blue, aggressive red, the ego yellow."""
+        if self.render_mode is None:
+            return None
+        return render_intersection(self._episodes.simulation, 0)
+
+    def close(self) -> None:
+        self._episodes.simulation.close()

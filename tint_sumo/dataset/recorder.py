@@ -1,0 +1,310 @@
+"""Record the traffic without the ego (paper III-B) to Parquet, shard by shard.
+
+A shard is a fixed number of episodes whose seeds follow from the dataset's seed and the shard's number, so that the
+dataset does not depend on the number of workers, and an interrupted recording resumes to the very same dataset.
+"""
+
+import platform
+import signal
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from tint_sumo.config import MAX_VEHICLES, WINDOW_STEPS, Scenario, Traffic
+from tint_sumo.dataset.schema import (
+    DRIVER_SCHEMA,
+    DRIVERS,
+    MANIFEST,
+    NO_LEADER_GAP_M,
+    SCHEMA_VERSION,
+    TRAJECTORIES,
+    TRAJECTORY_SCHEMA,
+    shard_file,
+)
+from tint_sumo.errors import InputError
+from tint_sumo.files import claim_folder, read_json, whole_file, write_json
+from tint_sumo.simulation.geometry import LANE_DIRECTION, LANE_NAMES
+from tint_sumo.simulation.intersections import Intersections
+
+EPISODES_PER_SHARD = 16
+EPISODE_STEPS = 500
+MIN_WINDOW_STEPS = 2  # a single step has no motion
+_WINDOWS_KEY = b"tint_sumo.windows"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What to record: at least ``windows`` windows of traffic with this share of conservative drivers."""
+
+    windows: int
+    p_conservative: float = 0.5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.windows < 1:
+            raise InputError(f"windows must be at least 1, not {self.windows}")
+        if self.seed < 0:
+            raise InputError(f"seed must not be negative: {self.seed}")
+        self.scenario()
+
+    def scenario(self) -> Scenario:
+        return Scenario(traffic=Traffic(p_conservative=self.p_conservative))
+
+    def settings(self) -> dict[str, Any]:
+        return {
+            "kind": "dataset",
+            "schema_version": SCHEMA_VERSION,
+            "windows": self.windows,
+            "p_conservative": self.p_conservative,
+            "seed": self.seed,
+        }
+
+
+def record(
+    out: Path,
+    windows: int,
+    *,
+    p_conservative: float = 0.5,
+    seed: int = 0,
+    workers: int = 1,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Record a dataset of at least ``windows`` windows into ``out`` and return its manifest.
+
+    The same call resumes an interrupted recording; a finished one is left as it is.
+
+    Raises:
+        InputError: bad values, or ``out`` holds another run.
+    """
+    recording = Recording(windows, p_conservative, seed)
+    if workers < 1:
+        raise InputError(f"workers must be at least 1, not {workers}")
+    claim_folder(out, recording.settings())
+    if (out / MANIFEST).exists():
+        return read_json(out / MANIFEST, "dataset manifest")
+    for leftover in out.glob("*/.*.partial"):
+        leftover.unlink()
+    counts: list[int] = []
+    with (
+        tqdm(total=windows, desc="record", unit=" windows", disable=not progress) as bar,
+        _shards(recording, out, workers) as shards,
+    ):
+        for count in shards:
+            counts.append(count)
+            bar.update(min(count, windows - bar.n))
+            if sum(counts) >= windows:
+                break
+    _remove_shards_from(out, len(counts))
+    manifest = _manifest(out, recording, counts)
+    write_json(out / MANIFEST, manifest)
+    return manifest
+
+
+@contextmanager
+def _shards(recording: Recording, out: Path, workers: int) -> Iterator[Iterator[int]]:
+    """Window counts of shards 0, 1, ..., recorded here or, ahead of their use, in worker processes."""
+    if workers == 1:
+        yield (_record_shard(recording, out, shard) for shard in _naturals())
+        return
+    context = get_context("spawn")  # a forked child would share a running libsumo
+    with ProcessPoolExecutor(workers, context, initializer=_ignore_interrupts) as pool:
+        try:
+            yield _ahead(pool, recording, out, workers)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _ahead(pool: ProcessPoolExecutor, recording: Recording, out: Path, workers: int) -> Iterator[int]:
+    pending: list[Future[int]] = []
+    for shard in _naturals():
+        pending.append(pool.submit(_record_shard, recording, out, shard))
+        if len(pending) > workers:
+            yield pending.pop(0).result()
+
+
+def _naturals() -> Iterator[int]:
+    number = 0
+    while True:
+        yield number
+        number += 1
+
+
+def _ignore_interrupts() -> None:
+    """Leave Ctrl-C to the main process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _remove_shards_from(out: Path, first: int) -> None:
+    """Workers run ahead: drop what they recorded beyond the last shard needed."""
+    for part in (TRAJECTORIES, DRIVERS):
+        for file in (out / part).glob("shard-*.parquet"):
+            if int(file.stem.split("-")[1]) >= first:
+                file.unlink()
+
+
+def _manifest(out: Path, recording: Recording, counts: list[int]) -> dict[str, Any]:
+    rows = {
+        part: sum(pq.read_metadata(shard_file(out, part, shard)).num_rows for shard in range(len(counts)))
+        for part in (TRAJECTORIES, DRIVERS)
+    }
+    return {
+        **recording.settings(),
+        "windows": sum(counts),
+        "windows_asked_for": recording.windows,
+        "window_steps": WINDOW_STEPS,
+        "no_leader_gap_m": NO_LEADER_GAP_M,
+        "rows": rows[TRAJECTORIES],
+        "drivers": rows[DRIVERS],
+        "shards": len(counts),
+        "episodes": len(counts) * EPISODES_PER_SHARD,
+        "episode_s": EPISODE_STEPS * recording.scenario().episode.step_s,
+        "versions": {name: version(name) for name in ("tint_sumo", "libsumo", "numpy", "pandas", "pyarrow")}
+        | {"python": platform.python_version()},
+    }
+
+
+def _record_shard(recording: Recording, out: Path, shard: int) -> int:
+    """Record one shard, unless it is there already, and return its number of windows."""
+    file = shard_file(out, TRAJECTORIES, shard)
+    if file.exists():
+        return int(pq.read_schema(file).metadata[_WINDOWS_KEY])
+    trajectories, drivers = simulate_episodes(
+        _simulation(recording.p_conservative), recording.seed, first_episode=shard * EPISODES_PER_SHARD
+    )
+    windows = count_windows(trajectories)
+    # The trajectories come last: where they are, the shard is complete.
+    _write(shard_file(out, DRIVERS, shard), drivers, DRIVER_SCHEMA, {})
+    _write(file, trajectories, TRAJECTORY_SCHEMA, {_WINDOWS_KEY: str(windows).encode()})
+    return windows
+
+
+@cache
+def _simulation(p_conservative: float) -> Intersections:
+    """This process's simulation; starting one for every shard would cost more than recording it."""
+    scenario = Scenario(traffic=Traffic(p_conservative=p_conservative))
+    return Intersections(EPISODES_PER_SHARD, scenario, with_ego=False)
+
+
+def _write(file: Path, frame: pd.DataFrame, schema: pa.Schema, metadata: Mapping[bytes, bytes]) -> None:
+    table = pa.Table.from_pandas(frame, schema, preserve_index=False)
+    table = table.replace_schema_metadata({**(table.schema.metadata or {}), **metadata})
+    with whole_file(file) as partial:
+        pq.write_table(table, partial, compression="zstd")
+
+
+def count_windows(trajectories: pd.DataFrame) -> int:
+    """Number of windows in whole tracks: pieces of 20 steps, and remainders of at least 2."""
+    steps = trajectories.groupby(["episode", "vehicle"]).size().to_numpy()
+    return int((steps // WINDOW_STEPS + (steps % WINDOW_STEPS >= MIN_WINDOW_STEPS)).sum())
+
+
+def simulate_episodes(
+    simulation: Intersections, seed: int, first_episode: int, steps: int = EPISODE_STEPS
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Run one episode in every replica; return rows of trajectories (by vehicle and time) and of drivers."""
+    replicas = simulation.replicas
+    for replica in range(replicas):
+        simulation.reset(replica, [seed, first_episode + replica])
+    shape = (steps + 1, replicas, MAX_VEHICLES)
+    front_m = np.empty(shape)
+    number, member, lane = (np.empty(shape, np.int64) for _ in range(3))
+    for step in range(steps + 1):
+        if step > 0:
+            simulation.step()
+        front_m[step] = simulation.front_m
+        number[step], member[step], lane[step] = simulation.vehicle_number, simulation.member, simulation.lane
+    desired_mps = np.array([one.desired_speed_mps for one in simulation.population])[member]
+    step_s, length_m = simulation.scenario.episode.step_s, simulation.scenario.vehicle.length_m
+    speed_mps = _speeds_mps(front_m, number, desired_mps, step_s)
+    leader, gap_m = _leaders(front_m, number, lane, length_m)
+
+    when, replica_at, slot = np.nonzero(number >= 0)
+    order = np.lexsort((when, number[when, replica_at, slot], replica_at))
+    at = (when[order], replica_at[order], slot[order])
+    keys = {"episode": first_episode + at[1], "vehicle": number[at]}
+    trajectories = pd.DataFrame(
+        {
+            **keys,
+            "time_s": at[0] * step_s,
+            "lane": pd.Categorical.from_codes(lane[at], list(LANE_NAMES)),
+            "direction": LANE_DIRECTION[lane[at]].astype(np.int8),
+            "position_m": front_m[at],
+            "speed_mps": speed_mps[at],
+            "acceleration_mps2": _accelerations_mps2(speed_mps, number, step_s)[at],
+            "leader": pd.arrays.IntegerArray(leader[at].astype(np.int16), leader[at] < 0),
+            "gap_m": gap_m[at],
+        }
+    )
+    first = ~trajectories.duplicated(["episode", "vehicle"]).to_numpy()
+    return trajectories, _driver_rows(simulation, {key: value[first] for key, value in keys.items()}, member[at][first])
+
+
+def _driver_rows(
+    simulation: Intersections, keys: Mapping[str, NDArray[np.int64]], member: NDArray[np.int64]
+) -> pd.DataFrame:
+    drivers = [simulation.population[index] for index in member]
+    return pd.DataFrame(
+        {
+            **keys,
+            "trait": pd.Categorical([driver.profile.name for driver in drivers]),
+            "vtype": [driver.type_id for driver in drivers],
+            "desired_speed_mps": [driver.desired_speed_mps for driver in drivers],
+            "min_gap_m": [driver.min_gap_m for driver in drivers],
+            "tau_s": [driver.idm.tau_s for driver in drivers],
+        }
+    )
+
+
+Floats = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+
+def _continues(number: Numbers) -> NDArray[np.bool_]:
+    """(T, R, 12): the slot held the same vehicle one step before."""
+    same = np.zeros(number.shape, bool)
+    same[1:] = (number[1:] == number[:-1]) & (number[1:] >= 0)
+    return same
+
+
+def _speeds_mps(front_m: Floats, number: Numbers, insertion_mps: Floats, step_s: float) -> Floats:
+    """SUMO's Euler update makes the displacement of a step exactly its speed times the step."""
+    moved_m = np.zeros_like(front_m)
+    moved_m[1:] = front_m[1:] - front_m[:-1]
+    return np.where(_continues(number), moved_m / step_s, insertion_mps)
+
+
+def _accelerations_mps2(speed_mps: Floats, number: Numbers, step_s: float) -> Floats:
+    change = np.full_like(speed_mps, np.nan)
+    change[1:] = (speed_mps[1:] - speed_mps[:-1]) / step_s
+    return np.where(_continues(number), change, np.nan)
+
+
+def _leaders(front_m: Floats, number: Numbers, lane: Numbers, length_m: float) -> tuple[Numbers, Floats]:
+    """Number of the next vehicle ahead on the lane (-1 if none) and the bumper-to-bumper gap to it (NaN if none)."""
+    present = number >= 0
+    leader, gap_m = np.full_like(number, -1), np.full_like(front_m, np.nan)
+    for step in range(len(front_m)):  # a step at a time keeps the (R, 12, 12) comparison in the cache
+        ahead_m = front_m[step][:, None, :] - front_m[step][:, :, None]
+        other = (
+            (lane[step][:, None, :] == lane[step][:, :, None]) & present[step][:, None, :] & present[step][:, :, None]
+        )
+        ahead_m = np.where(other & (ahead_m > 0.0), ahead_m, np.inf)
+        nearest = ahead_m.argmin(axis=2)
+        distance_m = np.take_along_axis(ahead_m, nearest[:, :, None], axis=2)[:, :, 0]
+        has_leader = np.isfinite(distance_m)
+        leader[step] = np.where(has_leader, np.take_along_axis(number[step], nearest, axis=1), -1)
+        gap_m[step] = np.where(has_leader, distance_m - length_m, np.nan)
+    return leader, gap_m

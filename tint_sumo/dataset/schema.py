@@ -1,0 +1,58 @@
+"""What a recorded dataset holds, and how it lies on disk.
+
+A dataset folder has ``trajectories/`` (one row per vehicle and step) and, apart from it, ``drivers/`` (one row per
+driver, with the trait label), each one Parquet file per shard, and ``manifest.json``, written last.
+"""
+
+from pathlib import Path
+
+import pyarrow as pa
+
+from tint_sumo.config import Street
+
+SCHEMA_VERSION = 1
+MANIFEST = "manifest.json"
+TRAJECTORIES = "trajectories"
+DRIVERS = "drivers"
+
+# Stands for the gap of every driver without a leader, whatever the driver's trait, and caps all gaps: half the street.
+NO_LEADER_GAP_M = Street().half_length_m
+
+
+def _field(name: str, dtype: pa.DataType, unit: str, meaning: str, nullable: bool = False) -> pa.Field:
+    return pa.field(name, dtype, nullable=nullable, metadata={"unit": unit, "meaning": meaning})
+
+
+_KEYS = [
+    _field("episode", pa.int32(), "1", "number of the episode, unique in the dataset"),
+    _field("vehicle", pa.int16(), "1", "number of the vehicle in its episode, in order of appearance"),
+]
+
+TRAJECTORY_SCHEMA = pa.schema(
+    [
+        *_KEYS,
+        _field("time_s", pa.float32(), "s", "since the episode's start"),
+        _field("lane", pa.dictionary(pa.int8(), pa.string()), "1", "lower or upper"),
+        _field("direction", pa.int8(), "1", "sign of the velocity along x: -1 west, 1 east"),
+        _field("position_m", pa.float32(), "m", "front bumper's distance along the lane"),
+        _field("speed_mps", pa.float32(), "m/s", "over the last step; at appearance the insertion speed"),
+        _field("acceleration_mps2", pa.float32(), "m/s2", "over the last step; null at appearance", nullable=True),
+        _field("leader", pa.int16(), "1", "vehicle ahead on the lane; null if none", nullable=True),
+        _field("gap_m", pa.float32(), "m", "bumper to bumper to the leader; null if none", nullable=True),
+    ]
+)
+
+DRIVER_SCHEMA = pa.schema(
+    [
+        *_KEYS,
+        _field("trait", pa.dictionary(pa.int8(), pa.string()), "1", "the label: conservative or aggressive"),
+        _field("vtype", pa.string(), "1", "SUMO vType"),
+        _field("desired_speed_mps", pa.float32(), "m/s", "IDM v0"),
+        _field("min_gap_m", pa.float32(), "m", "IDM minGap"),
+        _field("tau_s", pa.float32(), "s", "IDM desired time headway"),
+    ]
+)
+
+
+def shard_file(folder: Path, part: str, shard: int) -> Path:
+    return folder / part / f"shard-{shard:05d}.parquet"

@@ -1,0 +1,121 @@
+"""Windows of up to 20 steps for learning traits, from a recorded dataset. Labels are loaded apart."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from tint_sumo.config import WINDOW_STEPS
+from tint_sumo.dataset.recorder import MIN_WINDOW_STEPS
+from tint_sumo.dataset.schema import DRIVERS, MANIFEST, NO_LEADER_GAP_M, SCHEMA_VERSION, TRAJECTORIES
+from tint_sumo.errors import InputError
+from tint_sumo.files import read_json
+
+_DRIVERS_PER_EPISODE = 100_000
+
+
+@dataclass(frozen=True)
+class Windows:
+    """N windows of the states x of paper III-B; nothing in them tells the label."""
+
+    states: NDArray[
+        np.float32
+    ]  # (N, 20, 2): offset from the window's first position, gap to the leader; m; 0 at the end
+    length: NDArray[np.int64]  # (N,): valid steps, 2 to 20
+    driver: NDArray[np.int64]  # (N,): one number per driver, the same in all its windows
+    episode: NDArray[np.int64]  # (N,)
+    has_leader: NDArray[np.bool_]  # (N,): at every valid step
+
+    def __len__(self) -> int:
+        return len(self.length)
+
+    def __getitem__(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> Self:
+        """The windows at these indices."""
+        return type(self)(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+
+
+def load_windows(folder: Path) -> Windows:
+    """Cut every recorded track into windows of 20 steps; a remainder of at least 2 steps is a shorter window.
+
+    Raises:
+        InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
+    """
+    _check(folder)
+    columns = ["episode", "vehicle", "position_m", "gap_m"]
+    rows = _read(folder, TRAJECTORIES, columns)  # sorted by episode, vehicle and time
+    return cut_windows(
+        _driver_numbers(rows), rows["episode"].to_numpy(), rows["position_m"].to_numpy(), rows["gap_m"].to_numpy()
+    )
+
+
+def cut_windows(
+    driver: NDArray[np.int64],
+    episode: NDArray[np.integer],
+    position_m: NDArray[np.floating],
+    gap_m: NDArray[np.floating],
+) -> Windows:
+    """Windows from rows (M,) that are sorted by driver and time; ``gap_m`` is NaN without a leader."""
+    starts_track = np.r_[True, driver[1:] != driver[:-1]]
+    track_start = np.flatnonzero(starts_track)[np.cumsum(starts_track) - 1]
+    step = (np.arange(len(driver)) - track_start) % WINDOW_STEPS
+    window = np.cumsum(step == 0) - 1
+    length = np.bincount(window)
+    first = np.flatnonzero(step == 0)
+
+    states = np.zeros((len(length), WINDOW_STEPS, 2), np.float32)
+    states[window, step, 0] = position_m - position_m[first][window]
+    states[window, step, 1] = np.fmin(gap_m, NO_LEADER_GAP_M)
+    leaderless = np.bincount(window, weights=np.isnan(gap_m)) > 0
+    return Windows(states, length, driver[first], episode[first].astype(np.int64), ~leaderless)[
+        length >= MIN_WINDOW_STEPS
+    ]
+
+
+def load_labels(folder: Path, windows: Windows) -> NDArray[np.bool_]:
+    """Whether each window's driver is conservative; (N,). The only way to the label, for evaluation alone.
+
+    Raises:
+        InputError: the labels are missing or do not belong to these windows.
+    """
+    rows = _read(folder, DRIVERS, ["episode", "vehicle", "trait"])
+    known = _driver_numbers(rows)
+    row = pd.Index(known).get_indexer(pd.Index(windows.driver))
+    if (row < 0).any():
+        raise InputError(f"{folder / DRIVERS} lacks drivers of these windows; record the dataset anew")
+    return np.asarray(rows["trait"] == "conservative", bool)[row]
+
+
+def split_by_episode(windows: Windows, test_fraction: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of training and test windows; no episode, hence no driver, stands on both sides."""
+    episodes = np.unique(windows.episode)
+    shuffled = np.random.default_rng(seed).permutation(episodes)
+    test = shuffled[: round(test_fraction * len(episodes))]
+    in_test = np.isin(windows.episode, test)
+    return np.flatnonzero(~in_test), np.flatnonzero(in_test)
+
+
+def _check(folder: Path) -> None:
+    manifest = read_json(folder / MANIFEST, "dataset")
+    found = manifest.get("schema_version")
+    if found != SCHEMA_VERSION:
+        raise InputError(
+            f"{folder} has dataset schema version {found}, this tint_sumo reads {SCHEMA_VERSION}; record it anew"
+        )
+
+
+def _read(folder: Path, part: str, columns: list[str]) -> pd.DataFrame:
+    try:
+        return pd.read_parquet(folder / part, columns=columns)
+    except FileNotFoundError:
+        raise InputError(f"{folder / part} is missing; record the dataset anew") from None
+    except (OSError, ValueError, KeyError) as error:  # pyarrow's own errors derive from these
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{folder / part} is damaged ({reason}); record the dataset anew") from None
+
+
+def _driver_numbers(rows: pd.DataFrame) -> NDArray[np.int64]:
+    episode, vehicle = (rows[key].to_numpy(np.int64) for key in ("episode", "vehicle"))
+    return np.asarray(episode * _DRIVERS_PER_EPISODE + vehicle)

@@ -36,7 +36,7 @@ from tint_sumo.dataset.schema import (
 )
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, read_json, whole_file, write_json
-from tint_sumo.simulation.geometry import LANE_DIRECTION, LANE_NAMES
+from tint_sumo.scenario.geometry import LANE_DIRECTION, LANE_NAMES
 from tint_sumo.simulation.intersections import Intersections
 
 EPISODES_PER_SHARD = 16

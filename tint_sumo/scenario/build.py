@@ -6,7 +6,15 @@ from tint_sumo.config import Scenario
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_text
 from tint_sumo.scenario.drivers import DISTRIBUTION_ID, vtypes_xml
-from tint_sumo.scenario.network import EGO_ROUTE, LOWER_ROUTE, UPPER_ROUTE, build_network, name, plain_xml
+from tint_sumo.scenario.network import (
+    EGO_ROUTE,
+    LOWER_ROUTE,
+    REPLICA_SPACING_M,
+    UPPER_ROUTE,
+    build_network,
+    name,
+    plain_xml,
+)
 
 NET_FILE = "tint.net.xml"
 DRIVERS_FILE = "drivers.add.xml"
@@ -17,8 +25,10 @@ _SATURATED_RATE_PER_S = 1.0  # more than a lane can take: drivers who find no ro
 _MARK = "<!-- Written by tint-sumo net; change tint_sumo/scenario and run it again. -->\n"
 
 
-def scenario_files(replicas: int, scenario: Scenario | None = None) -> dict[str, str]:
-    """Name and text of every file of the scenario.
+def scenario_files(
+    replicas: int, scenario: Scenario | None = None, spacing_m: float = REPLICA_SPACING_M
+) -> dict[str, str]:
+    """Name and text of every file of the scenario; ``spacing_m`` as in :func:`plain_xml`.
 
     Raises:
         InputError: fewer than one replica.
@@ -26,7 +36,7 @@ def scenario_files(replicas: int, scenario: Scenario | None = None) -> dict[str,
     if replicas < 1:
         raise InputError(f"replicas must be at least 1, not {replicas}")
     scenario = scenario or Scenario()
-    sources = plain_xml(replicas, scenario.street, scenario.vehicle)
+    sources = plain_xml(replicas, scenario.street, scenario.vehicle, spacing_m)
     texts = {
         "tint.nod.xml": sources.nodes,
         "tint.edg.xml": sources.edges,

@@ -7,17 +7,18 @@ for both lanes would make upper-lane drivers brake for an ego that still stands 
 Formats: https://sumo.dlr.de/docs/Networks/PlainXML.html
 """
 
-import math
 import re
 import subprocess
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import sumo
 
 from tint_sumo.config import Street, VehicleShape
 from tint_sumo.errors import InputError
+from tint_sumo.scenario.geometry import EgoPath, junction_span_m
 
 LOWER_ROUTE = ("lower_in", "lower_out")
 UPPER_ROUTE = ("upper_in", "upper_out")
@@ -29,11 +30,10 @@ _SUMO_LANES = (
     ("upper_in.{replica}_0", ":U.{replica}_0_0", "upper_out.{replica}_0"),
 )
 
-# A power of two keeps coordinates of all replicas equally exact.
-REPLICA_SPACING_M = 128.0
+REPLICA_SPACING_M = 128.0  # for people to look at
 REPLICAS_PER_ROW = 16
-_HALF_LINK_RAD = 0.01  # half the arc that the edge between the two junctions covers
-_ARC_POINTS = 12
+_HALF_LINK_M = 0.06
+_TURN_POINTS = 16
 _NETCONVERT_OPTIONS = (
     "--lefthand",
     "--no-turnarounds",
@@ -55,12 +55,9 @@ def lane_id(lane: int, stage: int, replica: int) -> str:
     return _SUMO_LANES[lane][stage].format(replica=replica)
 
 
-def replica_origin(replica: int) -> tuple[float, float]:
+def replica_origin(replica: int, spacing_m: float = REPLICA_SPACING_M) -> tuple[float, float]:
     """Network coordinates (m) of a replica's own origin."""
-    return (
-        replica % REPLICAS_PER_ROW * REPLICA_SPACING_M,
-        replica // REPLICAS_PER_ROW * REPLICA_SPACING_M,
-    )
+    return replica % REPLICAS_PER_ROW * spacing_m, replica // REPLICAS_PER_ROW * spacing_m
 
 
 @dataclass(frozen=True)
@@ -72,10 +69,14 @@ class PlainXml:
     connections: str
 
 
-def plain_xml(replicas: int, street: Street | None = None, vehicle: VehicleShape | None = None) -> PlainXml:
-    """Write the sources of ``replicas`` intersections, far apart in one network."""
-    street, vehicle = street or Street(), vehicle or VehicleShape()
-    parts = [_Replica(index, street, vehicle) for index in range(replicas)]
+def plain_xml(replicas: int, street: Street, vehicle: VehicleShape, spacing_m: float = REPLICA_SPACING_M) -> PlainXml:
+    """Write the sources of ``replicas`` intersections in one network.
+
+    Vehicles of different replicas share no edge and no junction, so they never meet, not even with spacing 0. Then all
+    replicas have the same coordinates, hence the same rounding, and a simulated episode is the same in each of them to
+    the last bit.
+    """
+    parts = [_Replica(index, spacing_m, street, vehicle) for index in range(replicas)]
     return PlainXml(
         nodes=_document("nodes", [line for part in parts for line in part.nodes()]),
         edges=_document("edges", [line for part in parts for line in part.edges()]),
@@ -90,26 +91,27 @@ def _document(tag: str, lines: list[str]) -> str:
 @dataclass(frozen=True)
 class _Replica:
     index: int
+    spacing_m: float
     street: Street
     vehicle: VehicleShape
 
     def _point(self, x: float, y: float) -> str:
-        origin_x, origin_y = replica_origin(self.index)
+        origin_x, origin_y = replica_origin(self.index, self.spacing_m)
         return f"{origin_x + x:.3f},{origin_y + y:.3f}"
 
     def _shape(self, *points: tuple[float, float]) -> str:
         return " ".join(self._point(x, y) for x, y in points)
 
-    def _arc(self, start_rad: float, end_rad: float) -> str:
-        """Part of the ego's turn; its angle is 0 where the stem ends and pi/2 where the upper lane begins."""
-        radius = self.street.turn_radius_m
-        angles = [start_rad + (end_rad - start_rad) * i / _ARC_POINTS for i in range(_ARC_POINTS + 1)]
-        return self._shape(*((radius - radius * math.cos(a), radius * math.sin(a)) for a in angles))
+    def _turn(self, start_m: float, end_m: float, points: int) -> str:
+        """Part of the ego's path, between two path lengths."""
+        x, y = EgoPath(self.street, self.vehicle).point(np.linspace(start_m, end_m, points))
+        return self._shape(*zip(x.tolist(), y.tolist(), strict=True))
 
     @property
-    def _split_rad(self) -> float:
-        """Angle at which the turn leaves the lower lane."""
-        return math.asin(self.street.lane_width_m / self.street.turn_radius_m)
+    def _link_m(self) -> tuple[float, float]:
+        """Path lengths between which the edge from the lower junction to the upper one lies."""
+        border_m = EgoPath(self.street, self.vehicle).crossing_m(self.street.lower_y_m + self.street.lane_width_m / 2)
+        return border_m - _HALF_LINK_M, border_m + _HALF_LINK_M
 
     def nodes(self) -> list[str]:
         street, half_width = self.street, self.street.lane_width_m / 2
@@ -117,9 +119,11 @@ class _Replica:
         # lane's end just when its centre crosses the border.
         end = street.half_length_m + self.vehicle.length_m / 2
         low, high = street.lower_y_m - half_width, street.upper_y_m + half_width
-        middle, half = street.lower_y_m + half_width, street.junction_half_length_m
-        lower_shape = self._shape((-2, low), (2, low), (half, low), (half, middle), (-half, middle), (-half, low))
-        upper_shape = self._shape((-half, middle), (half, middle), (half, high), (-half, high))
+        middle = street.lower_y_m + half_width
+        (east, west), (upper_west, upper_east) = junction_span_m(street, self.vehicle).tolist()
+        stem = half_width
+        lower_shape = self._shape((-stem, low), (stem, low), (east, low), (east, middle), (west, middle), (west, low))
+        upper_shape = self._shape((upper_west, middle), (upper_east, middle), (upper_east, high), (upper_west, high))
 
         def node(part: str, x: float, y: float, extra: str) -> str:
             px, py = self._point(x, y).split(",")
@@ -144,13 +148,7 @@ class _Replica:
             return f'<edge id="{name(part, self.index)}" {ends} {lane} priority="{priority}"{shape}/>'
 
         stem = self._shape((0, -street.stem_length_m), (0, 0))
-        split, radius = self._split_rad, street.turn_radius_m
-        link = self._shape(
-            *(
-                (radius - radius * math.cos(a), radius * math.sin(a))
-                for a in (split - _HALF_LINK_RAD, split + _HALF_LINK_RAD)
-            )
-        )
+        link = self._turn(*self._link_m, points=2)
         return [
             edge("lower_in", "EL", "L", 3),
             edge("lower_out", "L", "WL", 3),
@@ -165,8 +163,10 @@ class _Replica:
             ends = f'from="{name(start, self.index)}" to="{name(end, self.index)}"'
             return f'<connection {ends} fromLane="0" toLane="0"{shape}/>'
 
-        first = self._arc(0, self._split_rad - _HALF_LINK_RAD)
-        second = self._arc(self._split_rad + _HALF_LINK_RAD, math.pi / 2)
+        path = EgoPath(self.street, self.vehicle)
+        link_start_m, link_end_m = self._link_m
+        first = f"{self._shape((0, 0))} {self._turn(path.turn_start_m, link_start_m, _TURN_POINTS)}"
+        second = self._turn(link_end_m, path.turn_end_m, _TURN_POINTS)
         return [
             connection("lower_in", "lower_out"),
             connection("upper_in", "upper_out"),

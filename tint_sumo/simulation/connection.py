@@ -69,5 +69,5 @@ def _traci(options: Sequence[str]) -> Connection:
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     with contextlib.redirect_stdout(io.StringIO()):  # traci prints every try
         connection = traci.connect(port, numRetries=_CONNECT_TRIES, proc=process, waitBetweenRetries=_CONNECT_WAIT_S)
-    # Closing tells sumo to end and waits for it.
+    connection.getVersion()  # sumo answers once it has loaded its input, whose files may then go
     return Connection("traci", connection.vehicle, connection.simulation, connection.simulationStep, connection.close)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from tint_sumo.config import Claim, EgoController, Street
-from tint_sumo.simulation.geometry import Bools, Floats, lane_y_m
+from tint_sumo.scenario.geometry import Bools, Floats, lane_y_m
 
 
 def is_unsafe(distance_m: Floats, closing_mps: Floats, controller: EgoController) -> Bools:

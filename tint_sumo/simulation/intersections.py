@@ -1,7 +1,7 @@
 """Many intersections in one SUMO simulation.
 
-Each replica is an intersection of its own, far from the others in the same network; its episode depends on its seed
-alone, not on the batch it runs in. State is kept in arrays, (R,) for egos and (R, 12) for vehicle slots; the only
+Each replica is an intersection of its own in the same network; its episode depends on its seed alone, not on the batch
+it runs in. State is kept in arrays, (R,) for egos and (R, 12) for vehicle slots; the only
 per-vehicle call into SUMO each step reads its lane position.
 """
 
@@ -18,10 +18,7 @@ from tint_sumo.config import MAX_VEHICLES, Backend, Scenario
 from tint_sumo.errors import InputError
 from tint_sumo.scenario.build import DRIVERS_FILE, NET_FILE, ROUTES_FILE, scenario_files
 from tint_sumo.scenario.drivers import EGO_TYPE, members
-from tint_sumo.scenario.network import EGO_ROUTE, lane_id, name
-from tint_sumo.simulation import ego as ego_control
-from tint_sumo.simulation.connection import Connection, connect
-from tint_sumo.simulation.geometry import (
+from tint_sumo.scenario.geometry import (
     LANE_NAMES,
     LOWER,
     UPPER,
@@ -31,9 +28,12 @@ from tint_sumo.simulation.geometry import (
     Pose,
     box_distance_m,
     centre_x_m,
-    lane_length_m,
     lane_y_m,
+    stage_start_m,
 )
+from tint_sumo.scenario.network import EGO_ROUTE, lane_id, name
+from tint_sumo.simulation import ego as ego_control
+from tint_sumo.simulation.connection import Connection, connect
 from tint_sumo.simulation.traffic import DriverStream
 
 _EMPTY = -1
@@ -80,7 +80,7 @@ def _sumo_options(folder: Path, step_s: float) -> list[str]:
 
 def _start(replicas: int, scenario: Scenario, backend: Backend) -> Connection:
     with tempfile.TemporaryDirectory(prefix="tint_sumo.") as folder:
-        for file, text in scenario_files(replicas, scenario).items():
+        for file, text in scenario_files(replicas, scenario, spacing_m=0.0).items():
             (Path(folder) / file).write_text(text, encoding="utf-8")
         return connect(_sumo_options(Path(folder), scenario.episode.step_s), backend)
 
@@ -115,10 +115,7 @@ class Intersections:
         self.path = EgoPath(scenario.street, scenario.vehicle)
         self._with_ego = with_ego
         self._yields = np.array([member.profile.yields for member in self.population])
-        self._lane_length_m = lane_length_m(scenario.street, scenario.vehicle)
-        half = scenario.street.junction_half_length_m
-        before = self._lane_length_m / 2 - half
-        self._stage_start_m = np.array([0.0, before, before + 2 * half])
+        self._stage_start_m = stage_start_m(scenario.street, scenario.vehicle)
 
         slots = (replicas, MAX_VEHICLES)
         self.present: Bools = np.zeros(slots, bool)
@@ -238,8 +235,8 @@ class Intersections:
         number = self._vehicle_count[replica]
         self._vehicle_count[replica] += 1
         vehicle_id = f"{replica}.{self._episodes[replica]}.{number}"
-        stage = int(np.searchsorted(self._stage_start_m, placed.front_m, side="right")) - 1
-        position_m = placed.front_m - self._stage_start_m[stage]
+        stage = int(np.searchsorted(self._stage_start_m[lane], placed.front_m, side="right")) - 1
+        position_m = placed.front_m - self._stage_start_m[lane, stage]
         vehicle = self._connection.vehicle
         vehicle.add(
             vehicle_id,
@@ -327,7 +324,7 @@ class Intersections:
 
     def _admit(self) -> None:
         """Let the upcoming drivers in where there is room, a free slot, and their time has come."""
-        front_m = self._stage_start_m[self._stage] + self._lane_pos_m
+        front_m = self._stage_start_m[self.lane, self._stage] + self._lane_pos_m
         entry_m = self.scenario.vehicle.length_m
         last_m = np.stack(
             [np.where(self.present & (self.lane == lane), front_m, np.inf).min(axis=1) for lane in (LOWER, UPPER)],
@@ -351,7 +348,7 @@ class Intersections:
         """Derive coordinates, and distances from the ego, of the given replicas."""
         street, shape = self.scenario.street, self.scenario.vehicle
         lane, present = self.lane[rows], self.present[rows]
-        self.front_m[rows] = self._stage_start_m[self._stage[rows]] + self._lane_pos_m[rows]
+        self.front_m[rows] = self._stage_start_m[lane, self._stage[rows]] + self._lane_pos_m[rows]
         self.x_m[rows] = centre_x_m(self.front_m[rows], lane, street, shape)
         self.y_m[rows] = lane_y_m(street)[lane]
         if not self._with_ego:

@@ -7,7 +7,7 @@ import numpy as np
 
 from tint_sumo.config import Scenario
 from tint_sumo.scenario.drivers import DriverMember
-from tint_sumo.simulation.geometry import lane_length_m
+from tint_sumo.scenario.geometry import lane_length_m
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ Frame of one intersection as in :class:`tint_sumo.config.Street`. Along its lane
 the distance of its front bumper from the lane's start; SUMO reports lane positions of the front bumper, too.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,19 @@ def centre_x_m(front_m: Floats, lane: NDArray[np.integer], street: Street, vehic
     return x
 
 
+def junction_span_m(street: Street, vehicle: VehicleShape) -> Floats:
+    """x where each junction starts and ends, seen by its lane's drivers; (2, 2) for lower and upper."""
+    half = street.junction_half_length_m
+    return np.array([(half, -half), (-half, EgoPath(street, vehicle).end_x_m)])
+
+
+def stage_start_m(street: Street, vehicle: VehicleShape) -> Floats:
+    """Distance along the lane at which its three SUMO lanes (before, on, after the junction) start; (2, 3)."""
+    outer_m = street.half_length_m + vehicle.length_m / 2
+    on_junction = outer_m + junction_span_m(street, vehicle) * LANE_DIRECTION[:, None]
+    return np.column_stack([np.zeros(2), on_junction])
+
+
 @dataclass(frozen=True)
 class Pose:
     """Centre, unit heading and front bumper of a batch of egos; each array (R,)."""
@@ -50,39 +64,63 @@ class Pose:
 
 @dataclass(frozen=True)
 class EgoPath:
-    """The ego's path by the length its front bumper has driven from the stem's start.
+    """The ego's fixed path by the length its front bumper has driven from the stem's start.
 
-    Straight up the stem, a quarter circle, then along the upper lane. As in SUMO the front follows the path and the
-    body lies between the front and the path point one vehicle length behind it.
+    The ego's centre drives up x = 0 to the origin, then a quarter circle to the upper lane's middle (code). SUMO leads
+    the front along a lane's shape and the back along the same shape one vehicle length behind it, so the shape is the
+    front's trace: straight on for half a vehicle more, then a quarter of the slightly larger circle around the same
+    centre. The ego's centre then stays within 0.3 m of its path.
     """
 
     street: Street
     vehicle: VehicleShape
 
     @property
+    def radius_m(self) -> float:
+        """Of the front's arc."""
+        return math.hypot(self.street.turn_radius_m, self.vehicle.length_m / 2)
+
+    @property
+    def start_rad(self) -> float:
+        """Angle of the front on its arc where the turn starts; 0 is west of the arc's centre, pi/2 north of it."""
+        return math.asin(self.vehicle.length_m / 2 / self.radius_m)
+
+    @property
     def turn_start_m(self) -> float:
-        return self.street.stem_length_m
+        return self.street.stem_length_m + self.vehicle.length_m / 2
 
     @property
     def turn_end_m(self) -> float:
-        return self.street.stem_length_m + np.pi / 2 * self.street.turn_radius_m
+        return self.turn_start_m + math.pi / 2 * self.radius_m
+
+    @property
+    def end_x_m(self) -> float:
+        """x of the front where the turn ends."""
+        return self.street.turn_radius_m + self.vehicle.length_m / 2
 
     def start_m(self, centre_y_m: float) -> float:
         """Front's path length for an ego on the stem with its centre at ``centre_y_m``."""
         return self.street.stem_length_m + centre_y_m + self.vehicle.length_m / 2
 
+    def crossing_m(self, y_m: float) -> float:
+        """Path length at which the front reaches ``y_m`` on the first half of its turn."""
+        return self.turn_start_m + self.radius_m * (math.asin(y_m / self.radius_m) - self.start_rad)
+
+    def _angle_rad(self, path_m: Floats) -> Floats:
+        turned_m: Floats = np.clip(path_m, self.turn_start_m, self.turn_end_m) - self.turn_start_m
+        return self.start_rad + turned_m / self.radius_m
+
     def point(self, path_m: Floats) -> tuple[Floats, Floats]:
         """x and y of path points."""
-        radius = self.street.turn_radius_m
-        angle = np.clip((path_m - self.turn_start_m) / radius, 0.0, np.pi / 2)
-        x = radius * (1.0 - np.cos(angle)) + np.maximum(path_m - self.turn_end_m, 0.0)
-        y = radius * np.sin(angle) + np.minimum(path_m - self.turn_start_m, 0.0)
+        angle = self._angle_rad(path_m)
+        x = self.street.turn_radius_m - self.radius_m * np.cos(angle) + np.maximum(path_m - self.turn_end_m, 0.0)
+        y = self.radius_m * np.sin(angle) + np.minimum(path_m - self.turn_start_m, 0.0)
         return x, y
 
     def direction_y(self, path_m: Floats) -> Floats:
         """y component of the path's unit tangent: how much of the front's speed leads across the lanes."""
-        angle: Floats = np.clip((path_m - self.turn_start_m) / self.street.turn_radius_m, 0.0, np.pi / 2)
-        return np.cos(angle)
+        in_turn = np.where(path_m < self.turn_end_m, np.cos(self._angle_rad(path_m)), 0.0)
+        return np.where(path_m < self.turn_start_m, 1.0, in_turn)
 
     def pose(self, front_m: Floats) -> Pose:
         front_x, front_y = self.point(front_m)

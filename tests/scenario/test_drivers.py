@@ -1,0 +1,34 @@
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Population, VehicleShape
+from tint_sumo.scenario.drivers import members, vtypes_xml
+
+
+def test_members_follow_the_papers_traits() -> None:
+    drivers = members(Population(members=200))
+    assert Counter(driver.profile.name for driver in drivers) == {"conservative": 200, "aggressive": 200}
+    for profile in (CONSERVATIVE, AGGRESSIVE):
+        gaps = [driver.min_gap_m for driver in drivers if driver.profile is profile]
+        low, high = profile.min_gap_m
+        assert low <= min(gaps) < low + 0.02
+        assert high - 0.02 < max(gaps) <= high
+        assert sum(gaps) / len(gaps) == pytest.approx((low + high) / 2, abs=0.015)
+    assert {driver.desired_speed_mps for driver in drivers if driver.profile is CONSERVATIVE} == {2.4}
+    assert {driver.desired_speed_mps for driver in drivers if driver.profile is AGGRESSIVE} == {3.0}
+
+
+def test_members_are_drawn_with_the_stated_seed() -> None:
+    population = Population()
+    assert members(population) == members(population)
+    assert members(population) != members(replace(population, seed=population.seed + 1))
+
+
+def test_distribution_has_the_probability_of_conservative_drivers() -> None:
+    xml = vtypes_xml(Population(members=4), 0.25, VehicleShape())
+    line = next(line for line in xml.splitlines() if "probabilities" in line)
+    weights = [float(weight) for weight in line.split('"')[1].split()]
+    assert sum(weights[:4]) == pytest.approx(0.25)
+    assert sum(weights) == pytest.approx(1.0)

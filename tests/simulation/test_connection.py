@@ -1,0 +1,43 @@
+import gc
+
+import pytest
+
+from tint_sumo.errors import InputError
+from tint_sumo.simulation.intersections import Intersections
+
+
+def test_a_second_simulation_in_the_process_takes_traci_and_libsumo_comes_back() -> None:
+    first, second = Intersections(1), Intersections(1)
+    assert (first.backend, second.backend) == ("libsumo", "traci")
+    with pytest.raises(InputError, match="libsumo already runs"):
+        Intersections(1, backend="libsumo")
+    first.close()
+    first.close()
+    third = Intersections(1, backend="libsumo")
+    assert third.backend == "libsumo"
+    second.close()
+    third.close()
+
+
+def test_traci_when_asked_for() -> None:
+    simulation = Intersections(1, backend="traci")
+    assert simulation.backend == "traci"
+    simulation.close()
+
+
+def test_a_forgotten_simulation_gives_libsumo_free() -> None:
+    simulation = Intersections(1, backend="libsumo")
+    del simulation
+    gc.collect()
+    again = Intersections(1, backend="libsumo")
+    again.close()
+
+
+def test_unknown_backend() -> None:
+    with pytest.raises(InputError, match="unknown backend 'gui'; choose auto, libsumo or traci"):
+        Intersections(1, backend="gui")  # type: ignore[arg-type]
+
+
+def test_traci_says_nothing_on_stdout(capfd: pytest.CaptureFixture[str]) -> None:
+    Intersections(1, backend="traci").close()
+    assert capfd.readouterr().out == ""

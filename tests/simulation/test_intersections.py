@@ -1,0 +1,296 @@
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.simulation.scenes import GO, STEP_S, scene
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, MAX_VEHICLES, EgoController, Idm, Population, Scenario, Traffic
+from tint_sumo.errors import InputError
+from tint_sumo.scenario.geometry import LANE_DIRECTION, LOWER, UPPER
+from tint_sumo.simulation.intersections import Intersections, PlacedVehicle
+
+STATE = ("present", "lane", "front_m", "member", "vehicle_number", "ego_front_m", "ego_speed_mps", "has_claimed")
+DESIRED_MPS = np.array([0.0, 0.5, 3.0])
+
+
+def history(simulation: Intersections, replica: int, seed: int, steps: int = 150) -> list[dict[str, Any]]:
+    """States of one replica under random actions that depend on the seed alone; other replicas stand."""
+    rng = np.random.default_rng(seed)
+    simulation.reset(replica, seed)
+    states = []
+    for step in range(steps):
+        desired = np.zeros(simulation.replicas)
+        desired[replica] = DESIRED_MPS[rng.integers(3)] if step % 5 else GO
+        simulation.step(desired)
+        states.append({key: np.array(getattr(simulation, key)[replica]) for key in STATE})
+        states[-1]["collision"] = simulation.collision[replica]
+    return states
+
+
+def assert_same(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> None:
+    for a, b in zip(first, second, strict=True):
+        assert a["collision"] == b["collision"]
+        for key in STATE:
+            present = a["present"] if a[key].shape == (MAX_VEHICLES,) else ...
+            np.testing.assert_array_equal(a[key][present], b[key][present], err_msg=key)
+
+
+@pytest.fixture(scope="module")
+def batch() -> Iterator[Intersections]:
+    simulation = Intersections(20)
+    for replica in range(20):
+        simulation.reset(replica, 1000 + replica)
+    yield simulation
+    simulation.close()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_episode_depends_on_its_seed_alone(batch: Intersections, seed: int) -> None:
+    """The same in another replica, at another time, beside other episodes, and in a simulation of its own."""
+    first = history(batch, 3, seed)
+    assert_same(first, history(batch, 19, seed))
+    alone = Intersections(1)
+    try:
+        assert alone.backend == "traci"  # libsumo is taken by the batch
+        assert_same(first, history(alone, 0, seed))
+    finally:
+        alone.close()
+
+
+def test_other_seeds_give_other_episodes(batch: Intersections) -> None:
+    with pytest.raises(AssertionError):
+        assert_same(history(batch, 0, 1), history(batch, 0, 2))
+
+
+@pytest.fixture(scope="module")
+def crowd() -> Iterator[tuple[Intersections, list[Any]]]:
+    """60 intersections with driving egos, and what happened in them."""
+    simulation = Intersections(60, Scenario(traffic=Traffic(p_conservative=0.25)))
+    rng = np.random.default_rng(0)
+    for replica in range(60):
+        simulation.reset(replica, [7, replica])
+    before = {key: np.array(getattr(simulation, key)) for key in STATE}
+    states = [before]
+    for step in range(250):
+        desired = rng.choice(DESIRED_MPS, 60) if step % 10 else np.full(60, GO)
+        simulation.step(desired)
+        for replica in range(60):
+            if simulation.collision[replica] or simulation.ego_pose().x_m[replica] > 8.0:
+                simulation.reset(replica, [8, replica, step])
+        states.append({key: np.array(getattr(simulation, key)) for key in STATE})
+    yield simulation, states
+    simulation.close()
+
+
+def test_vehicles_keep_their_slots_and_slots_rest_between_vehicles(crowd: tuple[Intersections, list[Any]]) -> None:
+    simulation = Intersections(8)
+    try:
+        for replica in range(8):
+            simulation.reset(replica, replica)
+        changes = 0
+        before = simulation.vehicle_number.copy()
+        for _ in range(400):
+            simulation.step(np.zeros(8))
+            now = simulation.vehicle_number.copy()
+            changed = now != before
+            assert ((now == -1) | (before == -1))[changed].all()
+            changes += int(changed.sum())
+            before = now
+        assert changes > 200
+    finally:
+        simulation.close()
+
+
+def test_vehicles_never_overlap_each_other_and_stay_on_the_street(crowd: tuple[Intersections, list[Any]]) -> None:
+    _, states = crowd
+    for state in states:
+        for lane in (LOWER, UPPER):
+            front_m = np.sort(np.where(state["present"] & (state["lane"] == lane), state["front_m"], np.nan), axis=1)
+            assert np.nanmin(np.diff(front_m, axis=1)) > 5.0
+            assert np.nanmin(front_m) >= 5.0
+            assert np.nanmax(front_m) <= 45.0
+        assert state["present"].sum(axis=1).max() <= MAX_VEHICLES
+
+
+def test_traits_are_drawn_with_their_probability(crowd: tuple[Intersections, list[Any]]) -> None:
+    simulation, states = crowd
+    yields = np.array([member.profile.yields for member in simulation.population])
+    drawn = yields[states[0]["member"][states[0]["present"]]]
+    spread = 4 * (0.25 * 0.75 / len(drawn)) ** 0.5
+    assert len(drawn) > 400
+    assert drawn.mean() == pytest.approx(0.25, abs=spread)
+
+
+def test_gaps_at_placement_are_those_of_the_follower(crowd: tuple[Intersections, list[Any]]) -> None:
+    simulation, states = crowd
+    state = states[0]
+    gaps: dict[str, list[float]] = {"conservative": [], "aggressive": []}
+    for replica in range(60):
+        for lane in (LOWER, UPPER):
+            slots = np.flatnonzero(state["present"][replica] & (state["lane"][replica] == lane))
+            order = slots[np.argsort(-state["front_m"][replica, slots])]
+            for leader, follower in pairwise(order):
+                profile = simulation.population[state["member"][replica, follower]].profile
+                gap_m = state["front_m"][replica, leader] - state["front_m"][replica, follower] - 5.0
+                gaps[profile.name].append(float(gap_m))
+    for profile in (CONSERVATIVE, AGGRESSIVE):
+        low, high = profile.entry_gap_m
+        assert low <= min(gaps[profile.name]) <= low + 0.2
+        assert high - 0.2 <= max(gaps[profile.name]) <= high
+        assert np.mean(gaps[profile.name]) == pytest.approx((low + high) / 2, abs=0.2)
+
+
+def test_newcomers_find_the_room_they_want() -> None:
+    simulation = Intersections(8)
+    try:
+        for replica in range(8):
+            simulation.reset(replica, [5, replica])
+        entries = 0
+        for _ in range(300):
+            before = simulation.vehicle_number.copy()
+            simulation.step(np.zeros(8))
+            for replica, slot in np.argwhere((before == -1) & simulation.present):
+                lane = simulation.lane[replica, slot]
+                others = simulation.present[replica] & (simulation.lane[replica] == lane)
+                others[slot] = False
+                gap_m = simulation.front_m[replica, others].min(initial=np.inf) - 5.0 - 5.0
+                low_m, high_m = simulation.population[simulation.member[replica, slot]].profile.entry_gap_m
+                assert simulation.front_m[replica, slot] == 5.0
+                assert low_m <= gap_m <= high_m + 3.0 * STEP_S  # within a step of finding its room
+                entries += 1
+        assert entries > 100
+    finally:
+        simulation.close()
+
+
+def test_poisson_arrivals_are_sparser_than_saturated_ones_and_have_their_rate() -> None:
+    rate_per_s, seconds, replicas = 0.1, 60, 40
+    simulation = Intersections(replicas, Scenario(traffic=Traffic(arrivals_per_s=rate_per_s)), with_ego=False)
+    try:
+        for replica in range(replicas):
+            simulation.reset(replica, replica)
+        placed = sum(simulation._vehicle_count)
+        for _ in range(round(seconds / STEP_S)):
+            simulation.step()
+        arrived = sum(simulation._vehicle_count) - placed
+        expected = rate_per_s * seconds * 2 * replicas
+        assert arrived == pytest.approx(expected, abs=4 * expected**0.5)
+    finally:
+        simulation.close()
+
+
+@pytest.mark.parametrize("tau_s", [0.7, 1.5])
+def test_followers_obey_the_idm_formula(tau_s: float) -> None:
+    """Treiber et al.: a [1 - (v/v0)^delta - (s*/s)^2], s* = s0 + max(0, v T + v dv / (2 sqrt(a b)))."""
+    idm = Idm(tau_s=tau_s)
+    scenario = Scenario(population=Population(idm=idm))
+    with scene((UPPER, AGGRESSIVE, -19.0), (UPPER, CONSERVATIVE, -10.0), scenario=scenario) as simulation:
+        follower = simulation.population[simulation.member[0, 0]]
+        speed = np.array([3.0, 2.4])
+        checked = 0
+        for _ in range(90):
+            front_m = simulation.front_m[0, :2].copy()
+            simulation.step(np.array([0.0]))
+            if not simulation.present[0, :2].all():
+                break
+            now = (simulation.front_m[0, :2] - front_m) / STEP_S
+            gap_m, closing = front_m[1] - front_m[0] - 5.0, speed[0] - speed[1]
+            braking = speed[0] * closing / (2 * (idm.accel_mps2 * idm.decel_mps2) ** 0.5)
+            wanted_m = follower.min_gap_m + max(0.0, speed[0] * idm.tau_s + braking)
+            ratio = (speed[0] / follower.desired_speed_mps) ** idm.delta
+            accel = idm.accel_mps2 * (1.0 - ratio - (wanted_m / gap_m) ** 2)
+            assert (now[0] - speed[0]) / STEP_S == pytest.approx(max(accel, -idm.emergency_decel_mps2), abs=1e-6)
+            speed = now
+            checked += 1
+        assert checked > 50
+
+
+def test_the_modelled_ego_is_where_sumo_has_it() -> None:
+    with scene() as simulation:
+        vehicle = simulation._connection.vehicle
+        rng = np.random.default_rng(1)
+        for _ in range(130):
+            simulation.step(np.array([rng.choice([0.5, 3.0, 3.0])]))
+            ego_id = simulation._ego_ids[0]
+            pose = simulation.ego_pose()
+            assert vehicle.getSpeed(ego_id) == pytest.approx(simulation.ego_speed_mps[0], abs=1e-9)
+            assert vehicle.getPosition(ego_id) == pytest.approx((pose.front_x_m[0], pose.front_y_m[0]), abs=0.02)
+            heading_deg = np.degrees(np.arctan2(pose.heading_x[0], pose.heading_y[0]))
+            assert vehicle.getAngle(ego_id) == pytest.approx(heading_deg, abs=0.5)
+        assert simulation.ego_pose().x_m[0] > 8.0
+
+
+def test_positions_are_sumos() -> None:
+    simulation = Intersections(3)
+    try:
+        for replica in range(3):
+            simulation.reset(replica, replica)
+        for _ in range(120):
+            simulation.step(np.zeros(3))
+        for replica, slot in np.argwhere(simulation.present):
+            x, y = simulation._connection.vehicle.getPosition(simulation._ids[replica][slot])
+            front_x = simulation.x_m[replica, slot] + 2.5 * LANE_DIRECTION[simulation.lane[replica, slot]]
+            assert (x, y) == pytest.approx((front_x, simulation.y_m[replica, slot]), abs=1e-9)
+    finally:
+        simulation.close()
+
+
+def test_sumo_reports_a_collision_just_when_the_boxes_overlap() -> None:
+    replicas = 40
+    careless = EgoController(unsafe_distance_m=0.0, closing_distance_m=0.0)
+    simulation = Intersections(replicas, Scenario(traffic=Traffic(p_conservative=0.2), ego=careless))
+    try:
+        for replica in range(replicas):
+            simulation.reset(replica, [3, replica])
+        rng = np.random.default_rng(3)
+        collisions = lag = 0
+        for step in range(300):
+            overlapped = (simulation._distance_m == 0.0).any(axis=1)
+            simulation.step(rng.choice(DESIRED_MPS, replicas) if step % 20 else np.full(replicas, GO))
+            overlaps = (simulation._distance_m <= 1e-3).any(axis=1)
+            for replica in range(replicas):
+                if simulation.collision[replica] is not None:
+                    assert overlaps[replica]
+                    lag += int(overlapped[replica])
+                    collisions += 1
+                    simulation.reset(replica, [4, replica, step])
+        assert collisions > 60
+        assert lag <= 0.02 * collisions  # a grazing contact may be seen one step late
+    finally:
+        simulation.close()
+
+
+def test_a_cleared_replica_is_empty_and_stays_so() -> None:
+    simulation = Intersections(2)
+    try:
+        for replica in range(2):
+            simulation.reset(replica, replica)
+        simulation.clear(0)
+        for _ in range(50):
+            simulation.step(np.full(2, GO))
+        assert not simulation.present[0].any()
+        assert simulation.present[1].any()
+        simulation.reset(0, 0)
+        assert simulation.present[0].any()
+    finally:
+        simulation.close()
+
+
+def test_an_ego_may_drive_off_the_street() -> None:
+    with scene() as simulation:
+        for _ in range(200):
+            simulation.step(np.array([GO]))
+        assert simulation.collision[0] is None
+
+
+def test_a_scene_holds_at_most_twelve_vehicles() -> None:
+    with scene() as simulation, pytest.raises(InputError, match="at most 12 vehicles"):
+        simulation.reset_to(0, [PlacedVehicle(0, 5.0, 0)] * 13)
+
+
+@pytest.mark.parametrize("p", [-0.1, 1.1, float("nan")])
+def test_probabilities_outside_the_unit_interval_are_refused(p: float) -> None:
+    with pytest.raises(InputError, match=r"must lie in \[0, 1\]"):
+        Traffic(p_conservative=p)

@@ -239,7 +239,7 @@ def simulate_episodes(
         {
             **keys,
             "time_s": at[0] * step_s,
-            "lane": pd.Categorical.from_codes(lane[at], list(LANE_NAMES)),
+            "lane": pd.Categorical(np.array(LANE_NAMES)[lane[at]], list(LANE_NAMES)),
             "direction": LANE_DIRECTION[lane[at]].astype(np.int8),
             "position_m": front_m[at],
             "speed_mps": speed_mps[at],

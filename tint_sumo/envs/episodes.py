@@ -19,7 +19,7 @@ from tint_sumo.config import (
     Traffic,
 )
 from tint_sumo.errors import InputError
-from tint_sumo.simulation.geometry import Bools, Floats, Pose
+from tint_sumo.scenario.geometry import Bools, Floats, Pose
 from tint_sumo.simulation.intersections import Intersections
 
 Observation = dict[str, NDArray[np.float32]]
@@ -91,10 +91,10 @@ class Transition:
 
 def reward_terms(speed_mps: Floats, success: Bools, collision: Bools, preset: RewardPreset) -> dict[str, Floats]:
     """The named terms whose sum is the reward (paper IV-A); (N,) each."""
-    driving = ~(success | collision)
+    driving = (~(success | collision)).astype(float)
     return {
-        "goal": preset.goal * success,
-        "collision": preset.collision * collision,
+        "goal": preset.goal * success.astype(float),
+        "collision": preset.collision * collision.astype(float),
         "speed": preset.speed_weight_per_mps * speed_mps * driving,
         "step": preset.step * driving,
     }

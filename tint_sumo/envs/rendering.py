@@ -6,6 +6,7 @@ from PIL import Image, ImageDraw
 
 from tint_sumo.config import Street
 from tint_sumo.errors import InputError
+from tint_sumo.scenario.geometry import LANE_DIRECTION
 from tint_sumo.simulation.intersections import Intersections
 
 RENDER_FPS = 10
@@ -27,10 +28,10 @@ def render_intersection(simulation: Intersections, replica: int) -> NDArray[np.u
     shape = simulation.scenario.vehicle
     for slot in np.flatnonzero(simulation.present[replica]):
         profile = simulation.population[simulation.member[replica, slot]].profile
-        heading = -1.0 if simulation.lane[replica, slot] == 0 else 1.0
+        direction = float(LANE_DIRECTION[simulation.lane[replica, slot]])
         colour = tuple(int(part) for part in profile.colour.split(","))
         centre = (simulation.x_m[replica, slot], simulation.y_m[replica, slot])
-        canvas.vehicle(centre, (heading, 0.0), shape.length_m, shape.width_m, colour)
+        canvas.vehicle(centre, (direction, 0.0), shape.length_m, shape.width_m, colour)
     pose = simulation.ego_pose()
     heading = (pose.heading_x[replica], pose.heading_y[replica])
     canvas.vehicle((pose.x_m[replica], pose.y_m[replica]), heading, shape.length_m, shape.width_m, _EGO)

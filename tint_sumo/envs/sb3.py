@@ -32,7 +32,7 @@ class TIntersectionVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{"traits": traits} for traits in infos["traits"]]
-        return observation  # type: ignore[return-value]
+        return observation
 
     def step_async(self, actions: NDArray[np.int64]) -> None:
         self._actions = actions
@@ -52,7 +52,7 @@ class TIntersectionVecEnv(VecEnv):
             }
             if final["_collision"][index]:
                 listed[index]["collision"] = final["collision"][index]
-        return observation, reward.astype(np.float32), done, listed  # type: ignore[return-value]
+        return observation, reward.astype(np.float32), done, listed
 
     def close(self) -> None:
         self.env.close()
@@ -66,7 +66,11 @@ class TIntersectionVecEnv(VecEnv):
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         raise NotImplementedError("the intersections share one simulation and have no methods of their own")
 
-    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+    def env_is_wrapped(
+        self,
+        wrapper_class: type[Any],  # noqa: ARG002 - the intersections are never wrapped one by one
+        indices: VecEnvIndices = None,
+    ) -> list[bool]:
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:

@@ -1,6 +1,6 @@
 """The single environment."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -12,7 +12,7 @@ from tint_sumo.envs.episodes import Episodes, Observation, TaskSettings, observa
 from tint_sumo.envs.rendering import RENDER_FPS, render_intersection, require_render_mode
 
 
-class TIntersectionEnv(gymnasium.Env[Observation, np.int64]):
+class TIntersectionEnv(gymnasium.Env[Any, Any]):
     """Turn right across one lane and merge into the other, among drivers whose traits are unknown.
 
     ## Description
@@ -29,8 +29,8 @@ class TIntersectionEnv(gymnasium.Env[Observation, np.int64]):
 
     | Key        | Shape     | Content                                                                          |
     |------------|-----------|----------------------------------------------------------------------------------|
-    | `ego`      | `(4,)`    | x, y, x velocity, y velocity of the ego's centre; origin where the stem meets the lower lane |
-    | `vehicles` | `(12, 2)` | x, y of each vehicle's centre relative to the ego's, with measurement noise; 0 in empty slots |
+    | `ego`      | `(4,)`    | x, y, x velocity, y velocity of the ego's centre; origin at the lower lane's edge |
+    | `vehicles` | `(12, 2)` | x, y of each vehicle's centre minus the ego's, with noise; 0 in empty slots    |
     | `mask`     | `(12,)`   | 1 where the slot holds a vehicle                                                 |
 
     A vehicle keeps its slot for as long as it is on the street; a slot stays empty for at least one step between two
@@ -76,7 +76,7 @@ class TIntersectionEnv(gymnasium.Env[Observation, np.int64]):
     * v0: first release.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012 - gymnasium's way
 
     def __init__(
         self,
@@ -95,7 +95,10 @@ class TIntersectionEnv(gymnasium.Env[Observation, np.int64]):
         self.action_space = spaces.Discrete(len(speeds_mps))
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,  # noqa: ARG002 - gymnasium's signature; there are none
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
         self._episodes.begin(0, self.np_random)
@@ -126,7 +129,7 @@ class TIntersectionEnv(gymnasium.Env[Observation, np.int64]):
             "time_s": float(self._episodes.steps[0] * step_s),
         }
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """(H, W, 3) image of the intersection; conservative drivers blue, aggressive red, the ego yellow."""
         if self.render_mode is None:
             return None

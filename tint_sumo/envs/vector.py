@@ -1,7 +1,7 @@
 """The vector environment: all environments are intersections of one simulation."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -25,7 +25,7 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
     ``infos["final_info"]``. All other infos are arrays over the environments.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata = {  # noqa: RUF012 - gymnasium's way
         "render_modes": ["rgb_array"],
         "render_fps": RENDER_FPS,
         "autoreset_mode": AutoresetMode.SAME_STEP,
@@ -113,13 +113,13 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
             infos |= _masked({"reward_terms": _masked(transition.reward_terms, everywhere)}, everywhere)
         return infos
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One (H, W, 3) image per environment."""
         if self.render_mode is None:
             return None
         return tuple(render_intersection(self._episodes.simulation, index) for index in range(self.num_envs))
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002 - gymnasium's signature
         self._episodes.simulation.close()
 
 

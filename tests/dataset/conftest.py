@@ -1,0 +1,3 @@
+from tests.dataset.test_recorder import dataset
+
+__all__ = ["dataset"]

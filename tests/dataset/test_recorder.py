@@ -1,0 +1,178 @@
+"""Recording, with real simulations and real kills."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
+from tint_sumo.dataset.recorder import EPISODE_STEPS, EPISODES_PER_SHARD, record, simulate_episodes
+from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES
+from tint_sumo.errors import InputError
+from tint_sumo.simulation.intersections import Intersections
+
+WINDOWS = 3000  # one shard
+TWO_SHARDS = 5000
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dataset")
+    record(folder, WINDOWS, seed=1, progress=False)
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for part in (TRAJECTORIES, DRIVERS)
+        for file in sorted((folder / part).iterdir())
+    }
+
+
+def test_rows_are_what_sumo_reports() -> None:
+    simulation = Intersections(2, with_ego=False)
+    try:
+        for replica in range(2):
+            simulation.reset(replica, [0, replica])
+        reported = []
+        vehicle = simulation._connection.vehicle
+        for step in range(1, 81):
+            simulation.step()
+            for replica, slot in np.argwhere(simulation.present):
+                vehicle_id = simulation._ids[replica][slot]
+                leader = vehicle.getLeader(vehicle_id, 100.0)
+                min_gap_m = simulation.population[simulation.member[replica, slot]].min_gap_m
+                reported.append(
+                    {
+                        "episode": replica,
+                        "vehicle": simulation.vehicle_number[replica, slot],
+                        "time_s": round(step * 0.1, 1),
+                        "speed": vehicle.getSpeed(vehicle_id),
+                        "acceleration": vehicle.getAcceleration(vehicle_id),
+                        "leader_id": None if not leader or not leader[0] else int(leader[0].split(".")[-1]),
+                        "gap": np.nan if not leader or not leader[0] else leader[1] + min_gap_m,
+                    }
+                )
+        rows, _ = simulate_episodes(simulation, seed=0, first_episode=0, steps=80)
+    finally:
+        simulation.close()
+    rows["time_s"] = rows["time_s"].round(1)
+    both = pd.DataFrame(reported).merge(rows, on=["episode", "vehicle", "time_s"])
+    assert len(both) == len(reported) > 500
+    np.testing.assert_allclose(both["speed_mps"], both["speed"], atol=1e-9)
+    seen = both["acceleration_mps2"].notna()
+    np.testing.assert_allclose(both["acceleration_mps2"][seen], both["acceleration"][seen], atol=1e-6)
+    # SUMO looks for leaders on the route ahead, where a vehicle about to leave the street may still be.
+    led = both["leader"].notna()
+    assert (both["leader"][led].astype(float) == both["leader_id"][led]).all()
+    np.testing.assert_allclose(both["gap_m"][led], both["gap"][led], atol=1e-6)
+    assert both["leader_id"][~led].isna().mean() > 0.95
+
+
+def test_the_tables_are_complete_and_sensible(dataset: Path) -> None:
+    rows = pd.read_parquet(dataset / TRAJECTORIES)
+    drivers = pd.read_parquet(dataset / DRIVERS)
+    assert rows["episode"].nunique() == EPISODES_PER_SHARD
+    assert rows["time_s"].max() == pytest.approx(EPISODE_STEPS * 0.1)
+    assert set(zip(rows["lane"], rows["direction"], strict=True)) == {("lower", -1), ("upper", 1)}
+    assert rows["position_m"].between(5.0, 45.0).all()
+    assert rows["speed_mps"].between(0.0, 3.0 + 1e-6).all()
+    assert (rows["gap_m"].dropna() > 0.3).all()
+    assert rows["leader"].isna().equals(rows["gap_m"].isna())
+    keys = ["episode", "vehicle"]
+    assert not drivers.duplicated(keys).any()
+    assert set(map(tuple, drivers[keys].to_numpy())) == set(map(tuple, rows[keys].drop_duplicates().to_numpy()))
+    for profile in (CONSERVATIVE, AGGRESSIVE):
+        mine = drivers[drivers["trait"] == profile.name]
+        assert len(mine) > 200
+        assert mine["desired_speed_mps"].unique() == pytest.approx([profile.desired_speed_mps])
+        assert mine["min_gap_m"].between(profile.min_gap_m[0] - 1e-6, profile.min_gap_m[1] + 1e-6).all()
+
+
+def test_time_runs_evenly_along_each_track(dataset: Path) -> None:
+    rows = pd.read_parquet(dataset / TRAJECTORIES)
+    steps = rows.groupby(["episode", "vehicle"])["time_s"].diff().dropna()
+    np.testing.assert_allclose(steps, 0.1, atol=1e-4)
+
+
+def test_columns_carry_their_units(dataset: Path) -> None:
+    import pyarrow.parquet as pq
+
+    schema = pq.read_schema(next((dataset / TRAJECTORIES).iterdir()))
+    assert schema.field("gap_m").metadata[b"unit"] == b"m"
+    assert schema.field("speed_mps").metadata[b"unit"] == b"m/s"
+
+
+def test_the_share_of_conservative_drivers_is_the_one_asked_for(tmp_path: Path) -> None:
+    record(tmp_path / "d", WINDOWS, p_conservative=0.25, seed=2, progress=False)
+    drivers = pd.read_parquet(tmp_path / "d" / DRIVERS)
+    spread = 4 * (0.25 * 0.75 / len(drivers)) ** 0.5
+    assert (drivers["trait"] == "conservative").mean() == pytest.approx(0.25, abs=spread)
+
+
+def test_the_dataset_does_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+    one = record(tmp_path / "one", TWO_SHARDS, progress=False)
+    two = record(tmp_path / "two", TWO_SHARDS, workers=2, progress=False)
+    assert one == two
+    assert one["shards"] == 2
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+
+
+def test_recording_again_leaves_a_finished_dataset_alone(dataset: Path) -> None:
+    before = {file: file.stat().st_mtime_ns for file in dataset.rglob("*")}
+    record(dataset, WINDOWS, seed=1, progress=False)
+    assert {file: file.stat().st_mtime_ns for file in dataset.rglob("*")} == before
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_recording_resumes_to_the_very_dataset(tmp_path: Path, sent: signal.Signals) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    record(whole, TWO_SHARDS, progress=False)
+    call = f"record(Path(r'{killed}'), {TWO_SHARDS})"
+    code = f"from pathlib import Path; from tint_sumo.dataset.recorder import record; {call}"
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while not list(killed.glob(f"{TRAJECTORIES}/shard-*.parquet")):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+    os.kill(process.pid, sent)
+    process.wait()
+    assert not (killed / MANIFEST).exists()
+    for file in killed.glob("*/shard-*.parquet"):
+        pd.read_parquet(file)  # whole
+    record(killed, TWO_SHARDS, progress=False)
+    assert contents(killed) == contents(whole)
+    assert (killed / MANIFEST).read_bytes() == (whole / MANIFEST).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"windows": 0}, "windows must be at least 1"),
+        ({"windows": 10, "p_conservative": 2.0}, r"must lie in \[0, 1\]"),
+        ({"windows": 10, "workers": 0}, "workers must be at least 1"),
+        ({"windows": 10, "seed": -1}, "seed must not be negative"),
+    ],
+)
+def test_bad_arguments_write_nothing(tmp_path: Path, arguments: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        record(tmp_path / "d", **arguments)  # type: ignore[arg-type]
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_folder_of_another_run_is_left_alone(dataset: Path, tmp_path: Path) -> None:
+    before = contents(dataset)
+    with pytest.raises(InputError, match=r"already holds another run \(different: seed\)"):
+        record(dataset, WINDOWS, seed=2)
+    assert contents(dataset) == before
+    (tmp_path / "letters.txt").write_text("dear")
+    with pytest.raises(InputError, match="already holds other files"):
+        record(tmp_path, WINDOWS)
+    assert [file.name for file in tmp_path.iterdir()] == ["letters.txt"]

@@ -1,0 +1,166 @@
+"""Windows, and that nothing in them tells the label."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
+from tint_sumo.dataset.recorder import simulate_episodes
+from tint_sumo.dataset.schema import DRIVERS, MANIFEST, NO_LEADER_GAP_M, TRAJECTORIES, TRAJECTORY_SCHEMA
+from tint_sumo.dataset.windows import Windows, cut_windows, load_labels, load_windows, split_by_episode
+from tint_sumo.errors import InputError
+from tint_sumo.simulation.intersections import Intersections, PlacedVehicle
+
+NAN = np.nan
+
+
+def test_tracks_are_cut_into_windows_of_twenty_steps_and_remainders_of_at_least_two() -> None:
+    steps = {3: 41, 5: 20, 8: 22, 9: 1}  # driver: track length
+    driver = np.repeat(list(steps), list(steps.values()))
+    position_m = np.concatenate([np.arange(n) * 0.3 + 5.0 for n in steps.values()])
+    windows = cut_windows(driver, driver // 5, position_m, np.full(len(driver), 4.0))
+    assert windows.driver.tolist() == [3, 3, 5, 8, 8]
+    assert windows.length.tolist() == [20, 20, 20, 20, 2]
+    assert windows.episode.tolist() == [0, 0, 1, 1, 1]
+    np.testing.assert_allclose(windows.states[1, :, 0], np.arange(20) * 0.3, atol=1e-5)
+    assert windows.states[4, 2:].tolist() == [[0.0, 0.0]] * 18
+
+
+def test_every_driver_without_a_leader_gets_the_same_gap_and_larger_gaps_are_capped() -> None:
+    gap_m = np.array([3.0, 25.0, NAN, NAN])
+    windows = cut_windows(np.array([0, 0, 1, 1]), np.zeros(4, int), np.array([5.0, 6.0, 5.0, 6.0]), gap_m)
+    assert windows.states[0, :2, 1].tolist() == [3.0, NO_LEADER_GAP_M]
+    assert windows.states[1, :2, 1].tolist() == [NO_LEADER_GAP_M, NO_LEADER_GAP_M]
+    assert windows.has_leader.tolist() == [True, False]
+
+
+def test_loaded_windows_match_the_rows(dataset: Path) -> None:
+    windows = load_windows(dataset)
+    assert len(windows) == json.loads((dataset / MANIFEST).read_text())["windows"]
+    assert windows.states.dtype == np.float32
+    assert (windows.states[:, 0, 0] == 0.0).all()
+    valid = np.arange(20) < windows.length[:, None]
+    assert (np.diff(windows.states[..., 0], axis=1)[valid[:, 1:]] >= 0.0).all()
+    assert (windows.states[~valid] == 0.0).all()
+    rows = pd.read_parquet(dataset / TRAJECTORIES)
+    first = rows[(rows["episode"] == rows["episode"].iloc[0]) & (rows["vehicle"] == rows["vehicle"].iloc[0])]
+    offset_m = first["position_m"].to_numpy()[:20] - first["position_m"].iloc[0]
+    np.testing.assert_array_equal(windows.states[0, : windows.length[0], 0], offset_m)
+
+
+def test_split_puts_every_episode_on_one_side(dataset: Path) -> None:
+    windows = load_windows(dataset)
+    train, test = split_by_episode(windows, 1 / 3, seed=0)
+    assert sorted([*train, *test]) == list(range(len(windows)))
+    assert not set(windows.episode[train]) & set(windows.episode[test])
+    assert len(test) / len(windows) == pytest.approx(1 / 3, abs=0.1)
+    np.testing.assert_array_equal(split_by_episode(windows, 1 / 3, seed=0)[1], test)
+
+
+# The label leak: in the authors' code a driver without a leader got a gap that told its trait.
+
+
+def test_changing_every_label_leaves_the_inputs_as_they_are(dataset: Path, tmp_path: Path) -> None:
+    """The loader reads nothing of the drivers' file: with all labels turned round the windows are the same."""
+    turned = tmp_path / "turned"
+    shutil.copytree(dataset, turned)
+    for file in (turned / DRIVERS).iterdir():
+        drivers = pd.read_parquet(file)
+        opposite = {"conservative": "aggressive", "aggressive": "conservative"}
+        drivers["trait"] = drivers["trait"].astype(str).map(opposite).astype("category")
+        drivers.to_parquet(file)
+    before, after = load_windows(dataset), load_windows(turned)
+    for field in ("states", "length", "driver", "episode", "has_leader"):
+        np.testing.assert_array_equal(getattr(before, field), getattr(after, field))
+    assert (load_labels(dataset, before) == ~load_labels(turned, after)).all()
+    shutil.rmtree(turned / DRIVERS)
+    np.testing.assert_array_equal(load_windows(turned).states, before.states)
+
+
+def test_trajectories_have_no_column_of_the_driver() -> None:
+    told = {"trait", "vtype", "type", "desired_speed_mps", "min_gap_m", "tau_s", "colour"}
+    assert not told & set(TRAJECTORY_SCHEMA.names)
+
+
+def test_drivers_that_move_alike_look_alike_whatever_their_trait() -> None:
+    """Behind a standing vehicle nobody moves, and nobody ahead is seen: the inputs of both traits are equal."""
+    rows = []
+    for profile in (CONSERVATIVE, AGGRESSIVE):
+        simulation = Intersections(1, with_ego=False)
+        member = next(i for i, one in enumerate(simulation.population) if one.profile is profile)
+        simulation.reset_to(0, [PlacedVehicle(1, 10.0, member)])
+        simulation._connection.vehicle.setSpeed(simulation._ids[0][0], 1.5)  # as if behind somebody slow
+        for _ in range(30):
+            simulation.step()
+        position_m = []
+        for _ in range(20):
+            position_m.append(simulation.front_m[0, 0])
+            simulation.step()
+        rows.append(cut_windows(np.zeros(20, int), np.zeros(20, int), np.array(position_m), np.full(20, NAN)))
+        simulation.close()
+    np.testing.assert_allclose(rows[0].states, rows[1].states, atol=1e-5)
+
+
+def test_numbers_and_order_do_not_tell_the_trait(dataset: Path) -> None:
+    """Episode and vehicle numbers, and being leaderless, are no better than guessing."""
+    windows = load_windows(dataset)
+    label = load_labels(dataset, windows)
+    _, first = np.unique(windows.driver, return_index=True)
+    number = windows.driver[first] % 100_000
+    for value in (number, number % 2, windows.episode[first]):
+        assert abs(np.corrcoef(value, label[first])[0, 1]) < 4 / len(first) ** 0.5
+    leaderless = windows.states[~windows.has_leader & (windows.length == 20)]
+    gaps = leaderless[..., 1]
+    assert set(np.unique(gaps[(gaps == gaps[:, :1]).all(axis=1)])) == {NO_LEADER_GAP_M}
+
+
+# Bad input
+
+
+def test_a_missing_dataset(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"dataset: no file .*manifest\.json; check the path"):
+        load_windows(tmp_path)
+
+
+def test_another_schema_version(dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(dataset, tmp_path / "d")
+    manifest = json.loads((tmp_path / "d" / MANIFEST).read_text())
+    (tmp_path / "d" / MANIFEST).write_text(json.dumps(manifest | {"schema_version": 0}))
+    with pytest.raises(InputError, match="schema version 0, this tint_sumo reads 1; record it anew"):
+        load_windows(tmp_path / "d")
+
+
+@pytest.mark.parametrize("keep", [0, 100, 5000])
+def test_a_damaged_shard(dataset: Path, tmp_path: Path, keep: int) -> None:
+    shutil.copytree(dataset, tmp_path / "d")
+    file = next((tmp_path / "d" / TRAJECTORIES).iterdir())
+    file.write_bytes(file.read_bytes()[:keep])
+    with pytest.raises(InputError, match=r"trajectories is damaged .*; record the dataset anew"):
+        load_windows(tmp_path / "d")
+
+
+def test_missing_labels(dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(dataset, tmp_path / "d")
+    windows = load_windows(dataset)
+    shutil.rmtree(tmp_path / "d" / DRIVERS)
+    with pytest.raises(InputError, match=r"drivers is missing; record the dataset anew"):
+        load_labels(tmp_path / "d", windows)
+
+
+def test_labels_of_other_windows(dataset: Path) -> None:
+    windows = load_windows(dataset)[:5]
+    strangers = Windows(windows.states, windows.length, windows.driver + 10**9, windows.episode, windows.has_leader)
+    with pytest.raises(InputError, match="lacks drivers of these windows"):
+        load_labels(dataset, strangers)
+
+
+def test_simulating_twice_gives_the_same_rows() -> None:
+    simulation = Intersections(2, with_ego=False)
+    first, second = (simulate_episodes(simulation, seed=4, first_episode=6, steps=40) for _ in range(2))
+    simulation.close()
+    pd.testing.assert_frame_equal(first[0], second[0])
+    pd.testing.assert_frame_equal(first[1], second[1])

@@ -1,0 +1,292 @@
+"""The single, the vector and the Stable-Baselines3 environment."""
+
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, VectorEnv
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+from stable_baselines3.common.vec_env import VecMonitor
+
+from tint_sumo import ENV_ID
+from tint_sumo.config import REWARD_PRESETS
+from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.envs.t_intersection import TIntersectionEnv
+from tint_sumo.envs.vector import TIntersectionVectorEnv
+from tint_sumo.errors import InputError
+
+GO, STOP = 2, 0
+
+
+@pytest.fixture
+def env() -> Iterator[TIntersectionEnv]:
+    env = TIntersectionEnv()
+    yield env
+    env.close()
+
+
+def play(env: gymnasium.Env[Any, Any], seed: int, steps: int = 150) -> list[Any]:
+    rng = np.random.default_rng(seed)
+    observation, info = env.reset(seed=seed)
+    record = [observation, info["traits"]]
+    for _ in range(steps):
+        observation, reward, terminated, truncated, info = env.step(rng.integers(3))
+        record += [observation, reward, terminated, truncated, info["traits"], info["outcome"]]
+        if terminated or truncated:
+            observation, info = env.reset()
+            record += [observation, info["traits"]]
+    return record
+
+
+def assert_equal(first: Any, second: Any) -> None:
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key in first:
+            assert_equal(first[key], second[key])
+    else:
+        np.testing.assert_array_equal(first, second)
+
+
+def test_gymnasium_makes_it_with_no_other_import() -> None:
+    code = f"""
+import gymnasium
+env = gymnasium.make("{ENV_ID}")
+env.reset(seed=0)
+print(env.step(0)[1])
+vector = gymnasium.make_vec("{ENV_ID}", num_envs=64, vectorization_mode="vector_entry_point")
+print(vector.reset(seed=0)[0]["vehicles"].shape)
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    reward, shape = result.stdout.split("\n")[:2]
+    assert float(reward) == pytest.approx(-0.0013)
+    assert shape == "(64, 12, 2)"
+
+
+def test_gymnasiums_checker(env: TIntersectionEnv) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*not been wrapped.*|.*spec is None.*|.*env.spec.*")
+        check_env(env, skip_render_check=True)
+
+
+def test_gymnasiums_checker_with_rendering() -> None:
+    env = gymnasium.make(ENV_ID, render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env.close()
+
+
+def test_stable_baselines3s_checker(env: TIntersectionEnv) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*unconventional shape.*")  # (12, 2): a set of vehicles
+        check_env_sb3(env)
+
+
+def test_one_seed_gives_one_history(env: TIntersectionEnv) -> None:
+    first = play(env, seed=3)
+    for a, b in zip(first, play(env, seed=3), strict=True):
+        assert_equal(a, b)
+    with pytest.raises(AssertionError):
+        for a, b in zip(first, play(env, seed=4), strict=False):
+            assert_equal(a, b)
+
+
+@pytest.mark.parametrize("num_envs", [3, 10])
+def test_each_environment_of_a_batch_lives_like_a_single_one(env: TIntersectionEnv, num_envs: int) -> None:
+    vector = TIntersectionVectorEnv(num_envs, time_limit_s=8.0, position_noise_m=0.1)
+    single = TIntersectionEnv(time_limit_s=8.0, position_noise_m=0.1)
+    try:
+        observations, infos = vector.reset(seed=20)
+        observation, info = single.reset(seed=22)
+        rng = np.random.default_rng(0)
+        ended = 0
+        for _ in range(250):
+            assert_equal(observation, {key: value[2] for key, value in observations.items()})
+            assert_equal(info["traits"], infos["traits"][2])
+            actions = rng.integers(3, size=num_envs)
+            observations, rewards, terminated, truncated, infos = vector.step(actions)
+            observation, reward, end, cut, info = single.step(actions[2])
+            assert (reward, end, cut) == (rewards[2], terminated[2], truncated[2])
+            if end or cut:
+                assert_equal(observation, infos["final_obs"][2])
+                assert info["outcome"] == infos["final_info"]["outcome"][2]
+                observation, info = single.reset()
+                ended += 1
+        assert ended >= 2
+    finally:
+        vector.close()
+        single.close()
+
+
+def test_the_observation_is_what_the_table_says(env: TIntersectionEnv) -> None:
+    observation, info = env.reset(seed=0)
+    simulation = env._episodes.simulation
+    assert observation["ego"] == pytest.approx([0.0, -5.0 / 20.0, 0.0, 0.0])
+    for _ in range(30):
+        observation, *_, info = env.step(np.int64(GO))
+    speed = simulation.ego_speed_mps[0] / 3.0
+    pose = simulation.ego_pose()
+    heading = np.array([pose.heading_x[0], pose.heading_y[0]])
+    assert observation["ego"][:2] * 20.0 == pytest.approx([pose.x_m[0], pose.y_m[0]], abs=1e-5)
+    assert observation["ego"][2:] == pytest.approx(speed * heading, abs=1e-6)
+    slots = np.flatnonzero(observation["mask"])
+    for slot in slots:
+        seen = observation["vehicles"][slot] * 20.0 + observation["ego"][:2] * 20.0
+        assert seen == pytest.approx([simulation.x_m[0, slot], simulation.y_m[0, slot]], abs=1e-4)
+        assert info["traits"][slot] == (1 if simulation.yields[0, slot] else -1)
+    empty = observation["mask"] == 0.0
+    assert not observation["vehicles"][empty].any()
+    assert not info["traits"][empty].any()
+    assert len(slots) >= 6
+
+
+def test_position_noise_has_its_standard_deviation_and_spares_the_ego() -> None:
+    clear, noisy = TIntersectionEnv(), TIntersectionEnv(position_noise_m=0.2, backend="traci")
+    try:
+        clear.reset(seed=1)
+        noisy.reset(seed=1)
+        errors = []
+        for _ in range(100):
+            exact, measured = clear.step(np.int64(STOP))[0], noisy.step(np.int64(STOP))[0]
+            assert_equal(exact["ego"], measured["ego"])
+            assert_equal(exact["mask"], measured["mask"])
+            real = exact["mask"] == 1.0
+            errors.append((measured["vehicles"] - exact["vehicles"])[real] * 20.0)
+            assert not measured["vehicles"][~real].any()
+        error = np.concatenate(errors)
+        assert error.std() == pytest.approx(0.2, rel=0.1)
+        assert abs(error.mean()) < 0.02
+    finally:
+        clear.close()
+        noisy.close()
+
+
+@pytest.mark.parametrize("preset", ["paper", "authors"])
+def test_rewards_and_outcomes(preset: str) -> None:
+    env = TIntersectionEnv(p_conservative=0.6, reward=preset, time_limit_s=15.0)
+    numbers = REWARD_PRESETS[preset]
+    outcomes = set()
+    try:
+        for seed in range(25):
+            env.reset(seed=seed)
+            terminated = truncated = False
+            while not (terminated or truncated):
+                _, reward, terminated, truncated, info = env.step(np.int64(STOP if seed == 0 else GO))
+                terms = info["reward_terms"]
+                assert reward == pytest.approx(sum(terms.values()))
+                speed_mps = env._episodes.simulation.ego_speed_mps[0]
+                expected = {
+                    "success": numbers.goal,
+                    "collision": numbers.collision,
+                }.get(info["outcome"], numbers.speed_weight_per_mps * speed_mps + numbers.step)
+                assert reward == pytest.approx(expected)
+            outcome = info["outcome"]
+            outcomes.add(outcome)
+            assert terminated is (outcome in ("success", "collision"))
+            assert truncated is (outcome == "timeout")
+            assert ("collision" in info) is (outcome == "collision")
+            if outcome == "success":
+                assert env._episodes.simulation.ego_pose().x_m[0] > 8.0
+            if outcome == "timeout":
+                assert info["time_s"] == pytest.approx(15.0)
+        assert outcomes == {"success", "collision", "timeout"}
+    finally:
+        env.close()
+
+
+def test_the_vector_environment_keeps_gymnasiums_contract() -> None:
+    vector = gymnasium.make_vec(ENV_ID, num_envs=5, vectorization_mode="vector_entry_point", time_limit_s=1.0)
+    assert isinstance(vector, VectorEnv)
+    assert vector.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    observation, infos = vector.reset(seed=0)
+    assert observation in vector.observation_space
+    for step in range(1, 31):
+        observation, reward, terminated, truncated, infos = vector.step(vector.action_space.sample())
+        assert observation in vector.observation_space
+        assert reward.shape == terminated.shape == truncated.shape == (5,)
+        assert truncated.all() == (step % 10 == 0)
+        assert ("final_obs" in infos) == (step % 10 == 0)
+        if step % 10 == 0:
+            assert set(infos["final_info"]["outcome"]) == {"timeout"}
+            assert (infos["time_s"] == 0.0).all()
+            assert infos["final_obs"][4] in vector.single_observation_space
+    vector.close()
+
+
+def test_a_reset_mask_resets_only_some() -> None:
+    vector = TIntersectionVectorEnv(2)
+    vector.reset(seed=0)
+    for _ in range(10):
+        vector.step(np.array([GO, GO]))
+    _, infos = vector.reset(options={"reset_mask": np.array([True, False])})
+    assert infos["time_s"].tolist() == [0.0, 1.0]
+    vector.close()
+
+
+def test_the_stable_baselines3_adapter() -> None:
+    venv = VecMonitor(TIntersectionVecEnv(4, seed=0, time_limit_s=1.0))
+    observation = venv.reset()
+    assert observation["vehicles"].shape == (4, 12, 2)
+    assert len(venv.reset_infos) == 4
+    kept = {key: value.copy() for key, value in observation.items()}
+    for _ in range(10):
+        following, _, dones, infos = venv.step(np.full(4, STOP))
+        assert_equal(observation, kept)  # returned arrays are not reused
+        observation, kept = following, {key: value.copy() for key, value in following.items()}
+    assert dones.all()
+    for info in infos:
+        assert info["TimeLimit.truncated"]
+        assert info["outcome"] == "timeout"
+        assert info["episode"]["l"] == 10
+        assert info["terminal_observation"]["mask"].sum() == np.abs(info["terminal_traits"]).sum()
+        assert info["traits"].shape == (12,)
+    assert venv.get_attr("render_mode") == [None] * 4
+    venv.close()
+
+
+def test_the_adapter_seeds_like_the_vector_environment() -> None:
+    venv, vector = TIntersectionVecEnv(3, seed=11), TIntersectionVectorEnv(3)
+    assert_equal(venv.reset(), vector.reset(seed=11)[0])
+    venv.close()
+    vector.close()
+
+
+def test_rendering_shows_every_vehicle() -> None:
+    env = TIntersectionEnv(render_mode="rgb_array")
+    _, info = env.reset(seed=0)
+    image = env.render()
+    assert image is not None and image.dtype == np.uint8 and image.shape == (320, 736, 3)
+    for value, colour in ((1, (40, 90, 200)), (-1, (200, 40, 40))):
+        pixels = np.isclose(image, colour, atol=3).all(axis=2).sum()
+        vehicles = int((info["traits"] == value).sum())
+        assert pixels == pytest.approx(vehicles * 5 * 2 * 16 * 16 * 0.85, rel=0.2)  # less the windscreens
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"p_conservative": 1.5}, r"must lie in \[0, 1\], not 1.5"),
+        ({"reward": "mine"}, "unknown reward preset 'mine'; choose one of paper, authors"),
+        ({"time_limit_s": 0.0}, "time_limit_s must be positive"),
+        ({"position_noise_m": -0.1}, "must not be negative"),
+        ({"render_mode": "human"}, "unknown render_mode 'human'"),
+    ],
+)
+def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        TIntersectionEnv(**arguments)
+
+
+def test_seeds_must_fit_the_environments() -> None:
+    vector = TIntersectionVectorEnv(2)
+    with pytest.raises(InputError, match="3 seeds do not fit 2 environments"):
+        vector.reset(seed=[1, 2, 3])
+    vector.close()
+    with pytest.raises(InputError, match="num_envs must be at least 1"):
+        TIntersectionVectorEnv(0)

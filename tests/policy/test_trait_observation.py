@@ -1,0 +1,277 @@
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from tint_sumo.config import POSITION_SCALE_M
+from tint_sumo.errors import InputError
+from tint_sumo.policy.trait_observation import EncoderTraits, NoTraits, OracleTraits, TraitObservation, TraitSource
+
+from .tasks import STREET, Memory
+
+LOWER_Y, UPPER_Y = 2.0, 6.0
+Scene = dict[int, tuple[float, float]]  # slot: centre (x, y) in m
+
+
+class Script(VecEnv):
+    """Environments that play scenes written by hand: ``episodes[env]`` is a list of episodes, an episode a list of
+    (scene, ego's y), one each step. Traits are conservative in even slots, aggressive in odd ones."""
+
+    def __init__(self, episodes: list[list[list[tuple[Scene, float]]]]) -> None:
+        super().__init__(len(episodes), STREET, spaces.Discrete(3))
+        self.episodes = episodes
+
+    def frame(self, env: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        scene, ego_y = self.episodes[env][self.episode[env]][self.time[env]]
+        ego = np.array([0.0, ego_y])
+        observation = {key: np.zeros(space.shape, np.float32) for key, space in STREET.items()}
+        observation["ego"][:2] = ego / POSITION_SCALE_M
+        labels = np.zeros(12, np.int8)
+        for slot, centre in scene.items():
+            observation["vehicles"][slot] = (np.array(centre) - ego) / POSITION_SCALE_M
+            observation["mask"][slot] = 1.0
+            labels[slot] = 1 if slot % 2 == 0 else -1
+        return observation, labels
+
+    def frames(self) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
+        observations, labels = zip(*map(self.frame, range(self.num_envs)), strict=True)
+        return {key: np.stack([o[key] for o in observations]) for key in STREET}, list(labels)
+
+    def reset(self) -> dict[str, np.ndarray]:
+        self.episode, self.time = [0] * self.num_envs, [0] * self.num_envs
+        observations, labels = self.frames()
+        self.reset_infos = [{"traits": label} for label in labels]
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None: ...
+
+    def step_wait(self) -> Any:
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        done = np.zeros(self.num_envs, bool)
+        for env, info in enumerate(infos):
+            self.time[env] += 1
+            done[env] = self.time[env] == len(self.episodes[env][self.episode[env]]) - 1
+            if done[env]:
+                info["terminal_observation"], info["terminal_traits"] = self.frame(env)
+                self.episode[env], self.time[env] = self.episode[env] + 1, 0
+        observations, labels = self.frames()
+        for info, label in zip(infos, labels, strict=True):
+            info["traits"] = label
+        return observations, np.zeros(self.num_envs, np.float32), done, infos
+
+    def close(self) -> None: ...
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [None] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None: ...
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        return []
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False] * self.num_envs
+
+
+class Spy:
+    """A trait model whose trait is (offset, gap) at the window's last step; it keeps what it was asked."""
+
+    latent_size = 2
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    def encode(self, states: torch.Tensor, length: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        self.calls.append((states, length))
+        last = states[torch.arange(len(length)), length - 1]
+        return last, torch.zeros_like(last)
+
+
+def play(episodes: list[list[list[tuple[Scene, float]]]], source: TraitSource, steps: int) -> tuple[np.ndarray, Any]:
+    """Traits (steps + 1, N, 12, 2) and all infos of a run."""
+    env = TraitObservation(Script(episodes), source)
+    traits, infos = [env.reset()["traits"]], []
+    for _ in range(steps):
+        observation, _, _, info = env.step(np.zeros(env.num_envs))
+        assert env.observation_space.contains({key: value[0] for key, value in observation.items()})
+        traits.append(observation["traits"])
+        infos.append(info)
+    return np.stack(traits), infos
+
+
+def drive(steps: int, ego_y: float = -5.0, scene: Scene | None = None) -> list[tuple[Scene, float]]:
+    """Slot 3 drives east in the upper lane at 2 m/s from x = -10, slot 5 west in the lower lane at 3 m/s from 10."""
+    return [
+        ({3: (-10.0 + 0.2 * k, UPPER_Y), 5: (10.0 - 0.3 * k, LOWER_Y), **(scene or {})}, ego_y) for k in range(steps)
+    ]
+
+
+def test_windows_of_the_last_twenty_steps() -> None:
+    spy = Spy()
+    traits, _ = play([[drive(60)]], EncoderTraits(spy), 45)
+    assert (traits[:20] == 0.0).all()
+    assert len(spy.calls) == 2
+    for states, length in spy.calls:
+        assert states.dtype == torch.float32 and states.shape == (2, 20, 2)
+        assert length.dtype == torch.int64 and length.tolist() == [20, 20]
+        steps = torch.arange(20)
+        torch.testing.assert_close(states[0, :, 0], 0.2 * steps, atol=1e-4, rtol=0)  # grows, whatever the direction
+        torch.testing.assert_close(states[1, :, 0], 0.3 * steps, atol=1e-4, rtol=0)
+        assert (states[..., 1] == 20.0).all()  # nobody ahead
+    np.testing.assert_allclose(traits[20:, 0, 3], [[3.8, 20.0]] * 26, atol=1e-4)
+    np.testing.assert_allclose(traits[20:, 0, 5], [[5.7, 20.0]] * 26, atol=1e-4)
+    assert (traits[:, 0, [0, 1, 2, 4, 6, 7, 8, 9, 10, 11]] == 0.0).all()
+
+
+def test_gap_is_to_the_nearest_vehicle_ahead_in_the_lane() -> None:
+    scene = {
+        0: (-15.0, UPPER_Y),  # 7 m to slot 1
+        1: (-3.0, UPPER_Y),  # 5.5 m to slot 2
+        2: (7.5, UPPER_Y),  # leads the upper lane
+        6: (-17.0, LOWER_Y),  # leads the lower lane, which runs west
+        7: (-10.0, LOWER_Y),  # 2 m to slot 6
+        8: (16.0, LOWER_Y),  # 21 m to slot 7: farther than a gap can be
+    }
+    spy = Spy()
+    play([[[(scene, -5.0)] * 30]], EncoderTraits(spy), 20)
+    ((states, _),) = spy.calls
+    expected = torch.tensor([7.0, 5.5, 20.0, 20.0, 2.0, 20.0])
+    torch.testing.assert_close(states[..., 1], expected[:, None].expand(6, 20), atol=1e-4, rtol=0)
+    assert (states[..., 0].abs() < 1e-4).all()
+
+
+def test_ego_motion_cancels_out() -> None:
+    moving = [(scene, -5.0 + 0.1 * k) for k, (scene, _) in enumerate(drive(30))]
+    traits, _ = play([[moving], [drive(30)]], EncoderTraits(Spy()), 20)
+    np.testing.assert_allclose(traits[20, 0], traits[20, 1], atol=1e-4)
+
+
+def test_short_windows_of_vehicles_seen_for_a_shorter_time() -> None:
+    """Slot 0 appears at step 13, slot 1 at step 19, slot 2 at step 20."""
+    episode = [
+        (
+            {
+                **scene,
+                **({0: (-20.0 + 0.1 * k, UPPER_Y)} if k >= 13 else {}),
+                **({1: (20.0 - 0.1 * k, LOWER_Y)} if k >= 19 else {}),
+                **({2: (5.0, UPPER_Y)} if k >= 20 else {}),
+            },
+            ego_y,
+        )
+        for k, (scene, ego_y) in enumerate(drive(30))
+    ]
+    spy = Spy()
+    traits, _ = play([[episode]], EncoderTraits(spy), 20)
+    ((states, length),) = spy.calls
+    assert length.tolist() == [8, 2, 20, 20]  # slots 0, 1, 3, 5
+    torch.testing.assert_close(states[0, :8, 0], 0.1 * torch.arange(8), atol=1e-4, rtol=0)
+    assert (states[0, 8:] == 0.0).all() and (states[1, 2:] == 0.0).all()
+    assert (traits[20, 0, 2] == 0.0).all()  # seen once only
+    assert (traits[20, 0, [0, 1, 3, 5]] != 0.0).any(axis=-1).all()
+
+
+def test_a_slot_is_zeroed_when_its_vehicle_leaves() -> None:
+    """Slot 3's vehicle leaves at step 25; another one takes the slot at step 27."""
+    episode = [
+        ({slot: at for slot, at in scene.items() if slot != 3 or not 25 <= k < 27}, ego_y)
+        for k, (scene, ego_y) in enumerate(drive(50))
+    ]
+    spy = Spy()
+    traits, _ = play([[episode]], EncoderTraits(spy), 42)
+    assert (traits[20:25, 0, 3] != 0.0).any(axis=-1).all()
+    assert (traits[25:40, 0, 3] == 0.0).all()
+    assert (traits[40:, 0, 3] != 0.0).any(axis=-1).all()
+    assert spy.calls[1][1].tolist() == [14, 20]  # steps 27..40 of the new vehicle only
+    assert (traits[20:, 0, 5] != 0.0).any(axis=-1).all()
+
+
+def test_drivers_in_a_passed_lane_keep_their_trait() -> None:
+    """From step 30 on the ego is past the lower lane, where vehicles stop; the upper lane is never passed."""
+    episode = drive(31) + [({3: (-4.0, UPPER_Y), 5: (1.0, LOWER_Y)}, 4.1)] * 40
+    spy = Spy()
+    traits, _ = play([[episode], [[(scene, min(ego_y, 3.9)) for scene, ego_y in episode]]], EncoderTraits(spy), 62)
+    assert [len(length) for _, length in spy.calls] == [4, 3, 3]
+    np.testing.assert_array_equal(traits[62, 0, 5], traits[20, 0, 5])
+    np.testing.assert_allclose(traits[62, 1, 5, 0], 0.0, atol=1e-4)
+    np.testing.assert_allclose(traits[62, :, 3, 0], 0.0, atol=1e-4)
+
+
+def test_a_new_episode_starts_over() -> None:
+    """Episodes of 26 and 21 steps side by side; the second ends just when its traits are inferred."""
+    spy = Spy()
+    long, short = drive(26), drive(21)
+    traits, infos = play([[long, long, long], [short, short, short]], EncoderTraits(spy), 50)
+    known = (traits[:, :, 3] != 0.0).any(axis=-1)
+    assert np.flatnonzero(known[:, 0]).tolist() == [20, 21, 22, 23, 24, 45, 46, 47, 48, 49]
+    assert not known[:, 1].any()  # at step 20 the next episode's first observation is shown
+    assert len(spy.calls) == 3  # both environments together at step 20, then one by one at 40 and 45
+    np.testing.assert_allclose(infos[19][1]["terminal_observation"]["traits"][3], [3.8, 20.0], atol=1e-4)
+    np.testing.assert_array_equal(infos[24][0]["terminal_observation"]["traits"], traits[24, 0])
+
+
+def test_reset_in_the_middle_of_an_episode_starts_over() -> None:
+    spy = Spy()
+    env = TraitObservation(Script([[drive(60)]]), EncoderTraits(spy))
+    env.reset()
+    for _ in range(25):
+        env.step(np.zeros(1))
+    assert (env.reset()["traits"] == 0.0).all()
+    for _ in range(19):
+        assert (env.step(np.zeros(1))[0]["traits"] == 0.0).all()
+    assert (env.step(np.zeros(1))[0]["traits"] != 0.0).any()
+    assert spy.calls[-1][1].tolist() == [20, 20]
+
+
+def test_no_vehicles_no_call() -> None:
+    spy = Spy()
+    traits, _ = play([[[({}, -5.0)] * 30]], EncoderTraits(spy), 25)
+    assert not spy.calls and (traits == 0.0).all()
+
+
+def test_scale_divides_traits() -> None:
+    plain, _ = play([[drive(30)]], EncoderTraits(Spy()), 20)
+    scaled, _ = play([[drive(30)]], EncoderTraits(Spy(), scale=8.0), 20)
+    np.testing.assert_allclose(scaled, plain / 8.0)
+
+
+def test_oracle_knows_at_once() -> None:
+    """Slot 5 is aggressive; slot 4, conservative, is on the street at the terminal observation only."""
+    first = drive(3)
+    first[2] = ({4: (0.0, LOWER_Y)}, -5.0)
+    traits, infos = play([[first, drive(9)], [drive(9)]], OracleTraits(), 3)
+    expected = np.zeros((12, 2))
+    expected[[3, 5]] = (0.0, 1.0)
+    np.testing.assert_array_equal(traits[0, 0], expected)
+    np.testing.assert_array_equal(traits, np.broadcast_to(expected, traits.shape))
+    terminal = np.zeros((12, 2))
+    terminal[4] = (1.0, 0.0)
+    np.testing.assert_array_equal(infos[1][0]["terminal_observation"]["traits"], terminal)
+
+
+def test_no_traits() -> None:
+    traits, infos = play([[drive(3), drive(9)]], NoTraits(), 4)
+    assert (traits == 0.0).all()
+    assert (infos[1][0]["terminal_observation"]["traits"] == 0.0).all()
+
+
+def test_observations_are_not_changed_later() -> None:
+    env = TraitObservation(Script([[drive(60)]]), EncoderTraits(Spy()))
+    shown = env.reset()["traits"]
+    for _ in range(20):
+        env.step(np.zeros(1))
+    assert (shown == 0.0).all()
+
+
+def test_model_of_another_latent_size_is_refused() -> None:
+    spy = Spy()
+    spy.latent_size = 3
+    with pytest.raises(InputError, match="2 numbers, this trait model's have 3"):
+        EncoderTraits(spy)
+
+
+def test_other_environments_are_refused() -> None:
+    with pytest.raises(InputError, match="ego, mask, vehicles"):
+        TraitObservation(Memory(2), NoTraits())

@@ -1,0 +1,304 @@
+"""The paper's policy network (III-C): attention over vehicles, a recurrent layer, an actor and a critic."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import Tensor, nn
+
+from tint_sumo.config import PolicySettings
+from tint_sumo.errors import InputError
+from tint_sumo.policy.gru import ResetGru
+
+OBSERVATION_KEYS = frozenset({"ego", "vehicles", "mask", "traits"})
+_FAR_BELOW = -1e9  # score of an empty slot; finite, so that a street without vehicles gives no NaN
+
+
+def _mlp(*sizes: int) -> nn.Sequential:
+    """Linear layers between ``sizes``, each followed by ReLU."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+class AttentionExtractor(BaseFeaturesExtractor):
+    """Features of the ego and the vehicles around it, which count as much as attention gives them.
+
+    Each vehicle's [position, trait, ego state] is embedded as e_i; its score comes from [e_i, mean of e]; the sum of
+    the e_i, weighted by the softmax of the scores, joins the ego state. Sizes are those of the authors' code
+    (``PolicySettings``).
+
+    Decisions where the sources differ:
+
+    - The paper calls the score itself the weight; the code applies softmax over the vehicles, as here.
+    - The code's softmax and mean include empty slots. Here neither does, and empty slots are not even computed: what
+      they hold has no influence. With no vehicle at all the weighted sum is zero.
+    - The code puts a ReLU on the scores before the softmax and passes each e_i through a 100-100-50 network before the
+      sum. Here scores may be negative, and the sum is of the e_i, as in the paper, before one 100-50 layer.
+
+    Args:
+        observation_space: Dict of ego (E,), vehicles (V, 2), mask (V,) and traits (V, Z).
+        settings: layer sizes.
+
+    Raises:
+        InputError: the observation space lacks one of these.
+    """
+
+    def __init__(self, observation_space: spaces.Dict, settings: PolicySettings | None = None) -> None:
+        settings = settings or PolicySettings()
+        super().__init__(observation_space, features_dim=settings.joint_sizes[-1])
+        missing = OBSERVATION_KEYS - set(observation_space.spaces)
+        if missing:
+            raise InputError(
+                f"the attention network needs observations with {', '.join(sorted(missing))}; "
+                "wrap the environment in TraitObservation"
+            )
+        ego_size, position_size, trait_size = (_last_axis(observation_space, k) for k in ("ego", "vehicles", "traits"))
+        embedded = settings.embedding_sizes[-1]
+        self.embed = _mlp(position_size + trait_size + ego_size, *settings.embedding_sizes)
+        self.score = nn.Sequential(*_mlp(2 * embedded, *settings.score_sizes), nn.Linear(settings.score_sizes[-1], 1))
+        self.context = _mlp(embedded, settings.context_size)
+        self.joint = _mlp(settings.context_size + ego_size, *settings.joint_sizes)
+
+    def forward(self, observations: dict[str, Tensor]) -> Tensor:
+        """Features (B, features_dim) of B observations."""
+        ego = observations["ego"]
+        slots, rows, embedded = self._embed_vehicles(observations)
+        weights = self._weights(observations["mask"], slots, rows, embedded)
+        chosen = weights.flatten().index_select(0, slots).unsqueeze(-1)
+        weighted = _sum_by_row(embedded * chosen.to(embedded.dtype), rows, len(ego))
+        features: Tensor = self.joint(torch.cat([self.context(weighted), ego], dim=-1))
+        return features
+
+    def attention(self, observations: dict[str, Tensor]) -> Tensor:
+        """Attention weights (B, V): they sum to 1 over the vehicles and are 0 in empty slots."""
+        return self._weights(observations["mask"], *self._embed_vehicles(observations))
+
+    def _embed_vehicles(self, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """The R real vehicles of a batch: flat slot index (R,), batch index (R,), embedding (R, embedded)."""
+        rows, columns = _real(observations["mask"]).nonzero(as_tuple=True)
+        slots = rows * observations["mask"].shape[-1] + columns
+        positions = observations["vehicles"].flatten(0, 1).index_select(0, slots)
+        traits = observations["traits"].flatten(0, 1).index_select(0, slots)
+        ego = observations["ego"].index_select(0, rows)
+        return slots, rows, self.embed(torch.cat([positions, traits, ego], dim=-1))
+
+    def _weights(self, mask: Tensor, slots: Tensor, rows: Tensor, embedded: Tensor) -> Tensor:
+        real = _real(mask)
+        mean = _sum_by_row(embedded, rows, len(mask)) / real.sum(-1, keepdim=True).clamp(min=1)
+        scores = self._scores(embedded, mean, rows).squeeze(-1).float()
+        dense = scores.new_full((mask.numel(),), _FAR_BELOW).index_copy(0, slots, scores)
+        return torch.softmax(dense.view_as(mask), dim=-1) * real
+
+    def _scores(self, embedded: Tensor, mean: Tensor, rows: Tensor) -> Tensor:
+        """The score network on [e_i, mean], (R, 1); its first layer meets each mean once, not once a vehicle."""
+        first = self.score[0]
+        assert isinstance(first, nn.Linear)
+        size = embedded.shape[-1]
+        own = nn.functional.linear(embedded, first.weight[:, :size], first.bias)
+        shared = nn.functional.linear(mean.to(embedded.dtype), first.weight[:, size:])
+        scores: Tensor = self.score[1:](own + shared.index_select(0, rows))
+        return scores
+
+
+def _last_axis(space: spaces.Dict, key: str) -> int:
+    shape = space[key].shape
+    assert shape is not None
+    return shape[-1]
+
+
+def _real(mask: Tensor) -> Tensor:
+    return mask > 0.5
+
+
+def _sum_by_row(values: Tensor, rows: Tensor, count: int) -> Tensor:
+    """Sum (R, F) values of one row each, (count, F)."""
+    return values.new_zeros(count, values.shape[-1]).index_add(0, rows, values)
+
+
+class GruPolicy(ActorCriticPolicy):
+    """Actor and critic on a GRU on a features extractor, for Stable-Baselines3.
+
+    Tensors of sequences are flat, (T * N, ...) with all N sequences of the first step first.
+
+    Args:
+        observation_space: any; ``AttentionExtractor`` is the default where it fits, else one of Stable-Baselines3's.
+        action_space: any that Stable-Baselines3 has a distribution for.
+        lr_schedule: learning rate as a function of the progress remaining.
+        settings: layer sizes.
+        use_bfloat16: in training mode, multiply matrices in bfloat16 in all but the output layers; weights and states
+            stay float32, and so does acting, where it gains nothing.
+        kwargs: further arguments of ``ActorCriticPolicy``.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        *,
+        settings: PolicySettings | None = None,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        use_bfloat16: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        self.settings = settings or PolicySettings()
+        self.use_bfloat16 = use_bfloat16
+        extractor = features_extractor_class or _default_extractor(observation_space)
+        extractor_kwargs = dict(features_extractor_kwargs or {})
+        if issubclass(extractor, AttentionExtractor):
+            extractor_kwargs.setdefault("settings", self.settings)
+        if not kwargs.keys() & {"optimizer_class", "optimizer_kwargs"}:
+            kwargs["optimizer_kwargs"] = {"eps": 1e-5, "fused": True}  # Adam as in Stable-Baselines3, in one pass
+        heads = list(self.settings.head_sizes)
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch={"pi": heads, "vf": heads},
+            features_extractor_class=extractor,
+            features_extractor_kwargs=extractor_kwargs,
+            **kwargs,
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        parameters = super()._get_constructor_parameters()
+        del parameters["net_arch"]
+        return {**parameters, "settings": self.settings, "use_bfloat16": self.use_bfloat16}
+
+    def _build_mlp_extractor(self) -> None:
+        self.gru = ResetGru(self.features_dim, self.settings.hidden_size)
+        self.features_dim = self.settings.hidden_size
+        super()._build_mlp_extractor()
+
+    def initial_states(self, count: int) -> Tensor:
+        """Hidden states at the start of ``count`` episodes, (count, hidden_size)."""
+        return torch.zeros(count, self.settings.hidden_size, device=self.device)
+
+    def _run(self, obs: PyTorchObs, states: Tensor, episode_starts: Tensor) -> tuple[Tensor, Tensor]:
+        """GRU outputs (T * N, hidden_size) and last states (N, hidden_size); ``episode_starts`` is (T, N)."""
+        features = self.extract_features(obs)
+        assert isinstance(features, Tensor)
+        outputs, states = self.gru(features.view(*episode_starts.shape, -1), states, episode_starts)
+        return outputs.flatten(0, 1), states
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.use_bfloat16 and self.training)
+
+    def forward(  # type: ignore[override]
+        self, obs: PyTorchObs, states: Tensor, episode_starts: Tensor, deterministic: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Act one step in N environments.
+
+        Args:
+            obs: N observations.
+            states: (N, hidden_size).
+            episode_starts: (N,), 1 where the observation is the first of an episode.
+            deterministic: take the likeliest action instead of a random one.
+
+        Returns:
+            Actions (N, ...), values (N, 1), log-probabilities (N,) and new states (N, hidden_size).
+        """
+        with self._autocast():
+            outputs, states = self._run(obs, states, episode_starts.unsqueeze(0))
+            latent_actor, latent_critic = self.mlp_extractor(outputs)
+        distribution = self._get_action_dist_from_latent(latent_actor.float())
+        actions = distribution.get_actions(deterministic=deterministic)
+        values = self.value_net(latent_critic.float())
+        return actions.view(-1, *self._action_shape()), values, distribution.log_prob(actions), states
+
+    def evaluate_actions(  # type: ignore[override]
+        self, obs: PyTorchObs, actions: Tensor, states: Tensor, episode_starts: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Values (T * N, 1), log-probabilities (T * N,) and entropies of N sequences of T steps.
+
+        Args:
+            obs: T * N observations.
+            actions: (T * N, ...), taken there.
+            states: (N, hidden_size), before the first step.
+            episode_starts: (T, N).
+        """
+        with self._autocast():
+            outputs, _ = self._run(obs, states, episode_starts)
+            latent_actor, latent_critic = self.mlp_extractor(outputs)
+        distribution = self._get_action_dist_from_latent(latent_actor.float())
+        return self.value_net(latent_critic.float()), distribution.log_prob(actions), distribution.entropy()
+
+    def predict_values(self, obs: PyTorchObs, states: Tensor, episode_starts: Tensor) -> Tensor:  # type: ignore[override]
+        """Values (N, 1) of N observations; arguments as in ``forward``."""
+        with self._autocast():
+            outputs, _ = self._run(obs, states, episode_starts.unsqueeze(0))
+            latent = self.mlp_extractor.forward_critic(outputs)
+        values: Tensor = self.value_net(latent.float())
+        return values
+
+    def get_distribution(  # type: ignore[override]
+        self, obs: PyTorchObs, states: Tensor, episode_starts: Tensor
+    ) -> tuple[Distribution, Tensor]:
+        """Action distribution and new states of N observations; arguments as in ``forward``."""
+        with self._autocast():
+            outputs, states = self._run(obs, states, episode_starts.unsqueeze(0))
+            latent = self.mlp_extractor.forward_actor(outputs)
+        return self._get_action_dist_from_latent(latent.float()), states
+
+    @torch.no_grad()
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        """Actions for one observation or a batch, as Stable-Baselines3 users know it.
+
+        Args:
+            observation: of one environment or of N.
+            state: what the last call returned; None at the beginning.
+            episode_start: (N,), true where ``observation`` is the first of an episode.
+            deterministic: take the likeliest action instead of a random one.
+
+        Returns:
+            The action or N actions, and the state for the next call.
+        """
+        self.set_training_mode(False)
+        obs, vectorized = self.obs_to_tensor(observation)
+        count = len(next(iter(obs.values()))) if isinstance(obs, dict) else len(obs)
+        states = self.initial_states(count) if state is None else torch.as_tensor(state[0], device=self.device)
+        starts = np.zeros(count, bool) if episode_start is None else np.asarray(episode_start).reshape(count)
+        distribution, states = self.get_distribution(obs, states, torch.as_tensor(starts, device=self.device))
+        actions = distribution.get_actions(deterministic=deterministic).view(-1, *self._action_shape()).cpu().numpy()
+        if isinstance(self.action_space, spaces.Box):
+            actions = np.clip(actions, self.action_space.low, self.action_space.high)
+        return actions if vectorized else actions[0], (states.cpu().numpy(),)
+
+    @torch.no_grad()
+    def attention_weights(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """Attention weights of one observation (V,) or of N (N, V), for plotting.
+
+        Raises:
+            InputError: the policy has no attention.
+        """
+        if not isinstance(self.features_extractor, AttentionExtractor):
+            raise InputError("this policy has no attention; take one with the attention network")
+        obs, vectorized = self.obs_to_tensor(observation)
+        assert isinstance(obs, dict)
+        weights: np.ndarray = self.features_extractor.attention(obs).cpu().numpy()
+        return weights if vectorized else weights[0]
+
+    def _action_shape(self) -> tuple[int, ...]:
+        assert self.action_space.shape is not None
+        return self.action_space.shape
+
+
+def _default_extractor(space: spaces.Space[Any]) -> type[BaseFeaturesExtractor]:
+    if not isinstance(space, spaces.Dict):
+        return FlattenExtractor
+    return AttentionExtractor if set(space.spaces) >= OBSERVATION_KEYS else CombinedExtractor

@@ -1,0 +1,284 @@
+"""Proximal policy optimisation of recurrent policies, as a Stable-Baselines3 algorithm."""
+
+import io
+import pathlib
+import pickle
+import zipfile
+import zlib
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import LinearSchedule, explained_variance, obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor, nn
+
+from tint_sumo.config import PpoSettings
+from tint_sumo.errors import InputError
+from tint_sumo.files import whole_file
+from tint_sumo.policy.buffer import SequenceBuffer, Sequences, buffer_class
+from tint_sumo.policy.network import GruPolicy
+
+_DEFAULTS = PpoSettings()
+_UNREADABLE = (  # what Stable-Baselines3 and torch raise for damaged files and for files of other models
+    ValueError, KeyError, RuntimeError, AssertionError, EOFError, zipfile.BadZipFile, zlib.error, pickle.UnpicklingError
+)  # fmt: skip
+_LINEAR = LinearSchedule(_DEFAULTS.learning_rate, 0.0, 1.0)
+
+
+class RecurrentPPO(OnPolicyAlgorithm):
+    """PPO (Schulman et al., 2017) for policies with a hidden state.
+
+    ``learn``, ``predict``, ``save``, ``load``, callbacks, logging and ``set_parameters`` are Stable-Baselines3's.
+    Minibatches hold the whole sequences of some environments, so gradients reach back to the rollout's start. Episodes
+    that end by time limit are bootstrapped with the value of their terminal observation. An interrupted run goes on
+    with ``load(path, env).learn(remaining, reset_num_timesteps=False)``, schedules included.
+
+    Args:
+        policy: ``"GruPolicy"`` or a class with its methods.
+        env: environment to learn from.
+        learning_rate: constant, or a function of the progress remaining (1 to 0).
+        n_steps: steps per environment and rollout.
+        n_minibatches: groups of environments per epoch.
+        n_epochs: passes over a rollout.
+        gamma: discount per step.
+        gae_lambda: trade-off of bias and variance in the advantages.
+        clip_range: of the probability ratio.
+        ent_coef: weight of the entropy.
+        vf_coef: weight of the values' squared error.
+        max_grad_norm: longer gradients are scaled down to this.
+        policy_kwargs: further arguments of the policy.
+        stats_window_size, tensorboard_log, verbose, seed, device: as in Stable-Baselines3.
+
+    Raises:
+        InputError: more minibatches than environments.
+    """
+
+    policy: GruPolicy
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"GruPolicy": GruPolicy}
+    rollout_buffer: SequenceBuffer
+
+    def __init__(
+        self,
+        policy: str | type[GruPolicy],
+        env: GymEnv | str,
+        *,
+        learning_rate: float | Schedule = _LINEAR,
+        n_steps: int = _DEFAULTS.n_steps,
+        n_minibatches: int = _DEFAULTS.n_minibatches,
+        n_epochs: int = _DEFAULTS.n_epochs,
+        gamma: float = _DEFAULTS.gamma,
+        gae_lambda: float = _DEFAULTS.gae_lambda,
+        clip_range: float = _DEFAULTS.clip_range,
+        ent_coef: float = _DEFAULTS.ent_coef,
+        vf_coef: float = _DEFAULTS.vf_coef,
+        max_grad_norm: float = _DEFAULTS.max_grad_norm,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            use_sde=False,
+            sde_sample_freq=-1,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.n_minibatches = n_minibatches
+        self.n_epochs = n_epochs
+        self.clip_range = clip_range
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        if self.n_minibatches > self.n_envs:
+            raise InputError(
+                f"n_minibatches={self.n_minibatches} but only {self.n_envs} environments: "
+                "a minibatch holds whole environments, so take fewer minibatches or more environments"
+            )
+        self.rollout_buffer_class = buffer_class(self.observation_space)
+        super()._setup_model()
+        self._last_states = self.policy.initial_states(self.n_envs)
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """Fill the buffer with ``n_rollout_steps`` steps of every environment; False if the callback stops it."""
+        assert isinstance(rollout_buffer, SequenceBuffer)
+        self.policy.set_training_mode(False)
+        rollout_buffer.reset()
+        rollout_buffer.states = self._last_states
+        callback.on_rollout_start()
+        for _ in range(n_rollout_steps):
+            obs, starts = self._last_obs, self._last_episode_starts
+            assert obs is not None and starts is not None, "learn resets the environment before it collects"
+            with torch.no_grad():
+                action_tensor, values, log_probs, states = self.policy(
+                    obs_as_tensor(obs, self.device), self._last_states, self._on_device(starts)
+                )
+            actions = action_tensor.cpu().numpy()
+            new_obs, rewards, dones, infos = env.step(self._within_bounds(actions))
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+            rewards = rewards + self.gamma * self._values_at_time_limit(dones, infos, states)
+            rollout_buffer.add(obs, actions, rewards, starts, values, log_probs)  # type: ignore[arg-type]
+            self._last_obs = new_obs  # type: ignore[assignment]
+            self._last_episode_starts, self._last_states = dones, states
+        with torch.no_grad():
+            last_values = self.policy.predict_values(
+                obs_as_tensor(new_obs, self.device),  # type: ignore[arg-type]
+                self._last_states,
+                self._on_device(dones),
+            )
+        rollout_buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _on_device(self, values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values, device=self.device)
+
+    def _within_bounds(self, actions: np.ndarray) -> np.ndarray:
+        if isinstance(self.action_space, spaces.Box):
+            actions = np.clip(actions, self.action_space.low, self.action_space.high)
+        return actions
+
+    def _values_at_time_limit(self, dones: np.ndarray, infos: list[dict[str, Any]], states: Tensor) -> np.ndarray:
+        """Values (N,) of the terminal observations of episodes cut off by the time limit, 0 elsewhere.
+
+        The hidden state there is ``states``, (N, hidden_size): the one after the episode's last action.
+        """
+        values = np.zeros(len(dones), np.float32)
+        cut = [int(i) for i in np.flatnonzero(dones) if infos[i].get("TimeLimit.truncated", False)]
+        if cut:
+            terminal = _stacked([infos[i]["terminal_observation"] for i in cut])
+            obs, _ = self.policy.obs_to_tensor(terminal)
+            with torch.no_grad():
+                predicted = self.policy.predict_values(obs, states[cut], self._on_device(np.zeros(len(cut), bool)))
+            values[cut] = predicted.flatten().cpu().numpy()
+        return values
+
+    def train(self) -> None:
+        """Improve the policy on the rollout in the buffer."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        records: dict[str, list[float]] = defaultdict(list)
+        for _ in range(self.n_epochs):
+            for batch in self.rollout_buffer.sequences(self.n_minibatches):
+                for name, value in self._update(batch).items():
+                    records[name].append(value)
+        self._n_updates += self.n_epochs
+        for name, values in records.items():
+            self.logger.record(f"train/{name}", np.mean(values))
+        buffer = self.rollout_buffer
+        self.logger.record(
+            "train/explained_variance", explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+        )
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _update(self, batch: Sequences) -> dict[str, float]:
+        """One gradient step; returns what is worth logging."""
+        values, log_probs, entropies = self.policy.evaluate_actions(
+            batch.observations, batch.actions, batch.states, batch.episode_starts
+        )
+        log_ratio = log_probs - batch.log_probs
+        ratio = log_ratio.exp()
+        clipped = ratio.clamp(1.0 - self.clip_range, 1.0 + self.clip_range)
+        policy_loss = -torch.minimum(batch.advantages * ratio, batch.advantages * clipped).mean()
+        value_loss = nn.functional.mse_loss(values.flatten(), batch.returns)
+        entropy = (-log_probs if entropies is None else entropies).mean()
+        loss = policy_loss - self.ent_coef * entropy + self.vf_coef * value_loss
+        self.policy.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+        self.policy.optimizer.step()
+        return {
+            "loss": loss.item(),
+            "policy_gradient_loss": policy_loss.item(),
+            "value_loss": value_loss.item(),
+            "entropy_loss": -entropy.item(),
+            "approx_kl": (ratio - 1.0 - log_ratio).mean().item(),
+            "clip_fraction": ((ratio - 1.0).abs() > self.clip_range).float().mean().item(),
+        }
+
+    def learn(  # noqa: PLR0917
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "RecurrentPPO",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for ``total_timesteps`` environment steps (further ones, without ``reset_num_timesteps``)."""
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Write policy, optimizer, settings and step count to one zip file, whole or not at all."""
+        if isinstance(path, io.BufferedIOBase):
+            super().save(path, exclude, include)
+            return
+        target = pathlib.Path(path)
+        with whole_file(target if target.suffix else target.with_suffix(".zip")) as partial:
+            super().save(partial, exclude, include)
+
+    @classmethod
+    def load(cls, path: str | pathlib.Path | io.BufferedIOBase, *args: Any, **kwargs: Any) -> Self:
+        """Read a model back; arguments as in Stable-Baselines3. Only for files you trust: they are unpickled.
+
+        Raises:
+            InputError: the file is missing or damaged, or ``env`` has other spaces than the model.
+        """
+        try:
+            return super().load(path, *args, **kwargs)
+        except InputError:
+            raise
+        except (FileNotFoundError, IsADirectoryError):
+            raise InputError(f"policy: no file {path}; check the path") from None
+        except _UNREADABLE as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"policy: {path} does not fit or is damaged ({reason}); train it anew") from error
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_last_states"]
+
+
+def _stacked(observations: list[Any]) -> Any:
+    """Observations of some environments as one batch."""
+    first = observations[0]
+    if isinstance(first, dict):
+        return {key: np.stack([observation[key] for observation in observations]) for key in first}
+    return np.stack(observations)

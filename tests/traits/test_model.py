@@ -1,0 +1,63 @@
+import pytest
+import torch
+
+from tint_sumo.config import VaeSettings
+from tint_sumo.errors import InputError
+from tint_sumo.traits import METHODS
+from tint_sumo.traits.model import FEATURE_SPREAD, find_method, register
+from tint_sumo.traits.vae import Vae
+
+
+@pytest.fixture
+def model() -> Vae:
+    return Vae(VaeSettings())
+
+
+@pytest.fixture
+def states() -> torch.Tensor:
+    """Two windows of five steps; the second has three valid ones."""
+    offset = torch.tensor([[0.0, 0.2, 0.5, 0.9, 1.4], [0.0, 0.3, 0.6, 0.0, 0.0]])
+    gap = torch.tensor([[3.0, 3.1, 3.2, 3.3, 3.4], [20.0, 20.0, 20.0, 0.0, 0.0]])
+    return torch.stack((offset, gap), dim=2)
+
+
+LENGTH = torch.tensor([5, 3])
+
+
+def test_features_of_the_training_data_are_centred_and_scaled_over_valid_steps(model, states):
+    model.fit_features(states, LENGTH)
+    features = model.features(states, LENGTH)
+    moving = torch.cat((features[0, 1:], features[1, 1:3]))
+    assert moving.mean(dim=0).numpy() == pytest.approx([0.0, 0.0], abs=1e-5)
+    assert moving.std(dim=0, correction=0).numpy() == pytest.approx(FEATURE_SPREAD, abs=1e-5)
+
+
+def test_features_can_be_turned_back_into_offset_and_gap(model, states):
+    model.fit_features(states, LENGTH)
+    raw = model.features(states, LENGTH) * model.feature_scale + model.feature_mean
+    raw[:, 0, 0] = 0.0
+    offset, gap = raw[..., 0].cumsum(dim=1), raw[..., 1]
+    for window, length in enumerate(LENGTH):
+        assert torch.allclose(offset[window, :length], states[window, :length, 0], atol=1e-6)
+        assert torch.allclose(gap[window, :length], states[window, :length, 1], atol=1e-5)
+
+
+def test_a_constant_feature_is_only_centred(model, states):
+    states[..., 1] = 20.0
+    model.fit_features(states, LENGTH)
+    assert model.feature_scale[1] == 1.0
+    assert torch.all(model.features(states, LENGTH)[..., 1] == 0.0)
+
+
+def test_two_methods_of_one_name_are_refused():
+    class Another(Vae):
+        method = "ours"
+
+    with pytest.raises(ValueError, match="two trait methods are called 'ours'"):
+        register(Another)
+    assert METHODS["ours"] is Vae
+
+
+def test_an_unknown_method_is_answered_with_the_known_ones():
+    with pytest.raises(InputError, match=r"unknown trait method 'theirs'; choose one of: .*ours"):
+        find_method("theirs")

@@ -1,0 +1,150 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tint_sumo.dataset.windows import Windows
+from tint_sumo.errors import InputError
+from tint_sumo.traits import load, training
+from tint_sumo.traits.evaluation import evaluate
+from tint_sumo.traits.training import CHECKPOINT_FILE, train
+from tint_sumo.traits.vae import Vae
+
+
+@pytest.fixture
+def windows(street):
+    return street[0]
+
+
+def assert_same_weights(one, other):
+    assert one.state_dict().keys() == other.state_dict().keys()
+    for name, value in one.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name]), name
+
+
+def interrupt_at_step(monkeypatch, step):
+    """Press Ctrl-C in the middle of training, before the given gradient step."""
+    original, calls = Vae.loss, iter(range(step))
+
+    def loss(self, *args):
+        if next(calls, None) is None:
+            raise KeyboardInterrupt
+        return original(self, *args)
+
+    monkeypatch.setattr(Vae, "loss", loss)
+
+
+def test_a_run_writes_a_model_that_loads_as_trained(windows, small, tmp_path):
+    model = train(windows, small, tmp_path / "run", progress=False, card={"data": "street"})
+    assert_same_weights(load(tmp_path / "run"), model)
+    assert not model.training
+    card = json.loads((tmp_path / "run" / "model.json").read_text())
+    assert card["method"] == "ours"
+    assert card["latent_size"] == 2
+    assert card["data"] == "street"
+    assert card["windows"] == len(windows.length)
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"run.json", "model.json", "model.safetensors"}
+
+
+def test_an_interrupted_run_resumes_to_the_very_same_weights(windows, small, tmp_path, monkeypatch):
+    whole = train(windows, small, tmp_path / "whole", progress=False)
+    steps_per_epoch = -(-len(windows.length) // small.batch_size)
+    monkeypatch.setattr(training, "CHECKPOINT_INTERVAL_S", 0.0)
+    with monkeypatch.context() as interrupted, pytest.raises(KeyboardInterrupt):
+        interrupt_at_step(interrupted, steps_per_epoch + 3)
+        train(windows, small, tmp_path / "broken", progress=False)
+    assert {path.name for path in (tmp_path / "broken").iterdir()} == {"run.json", CHECKPOINT_FILE}
+
+    with monkeypatch.context() as counted:
+        interrupt_at_step(counted, 2 * steps_per_epoch)  # the two epochs of three that are left
+        resumed = train(windows, small, tmp_path / "broken", progress=False)
+    assert_same_weights(resumed, whole)
+    cards = [json.loads((tmp_path / run / "model.json").read_text()) for run in ("whole", "broken")]
+    assert cards[0] == cards[1]
+    assert not (tmp_path / "broken" / CHECKPOINT_FILE).exists()
+
+
+def test_a_finished_run_is_loaded_and_not_repeated(windows, small, tmp_path, monkeypatch):
+    model = train(windows, small, tmp_path, progress=False)
+    interrupt_at_step(monkeypatch, 0)
+    assert_same_weights(train(windows, small, tmp_path, progress=False), model)
+
+
+def test_the_seed_decides_the_result_and_the_global_generator_is_left_alone(windows, small, tmp_path):
+    torch.manual_seed(5)
+    expected = torch.rand(1)
+    torch.manual_seed(5)
+    first = train(windows, small, tmp_path / "a", seed=7, progress=False)
+    assert torch.equal(torch.rand(1), expected)
+    assert_same_weights(train(windows, small, tmp_path / "b", seed=7, progress=False), first)
+    other = train(windows, small, tmp_path / "c", seed=8, progress=False)
+    assert not torch.equal(other.mean_head.weight, first.mean_head.weight)
+
+
+@pytest.mark.parametrize("change", ["seed", "settings", "windows"])
+def test_a_folder_of_another_run_is_refused_and_kept(windows, small, tmp_path, change):
+    train(windows, small, tmp_path, progress=False)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    settings = replace(small, epochs=9) if change == "settings" else small
+    shifted = replace(windows, states=windows.states + np.float32(0.5)) if change == "windows" else windows
+    with pytest.raises(InputError, match=f"already holds another run.*{change}"):
+        train(shifted, settings, tmp_path, seed=int(change == "seed"), progress=False)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_damaged_checkpoint_is_reported(windows, small, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "CHECKPOINT_INTERVAL_S", 0.0)
+    with monkeypatch.context() as interrupted, pytest.raises(KeyboardInterrupt):
+        interrupt_at_step(interrupted, 10)
+        train(windows, small, tmp_path, progress=False)
+    checkpoint = tmp_path / CHECKPOINT_FILE
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"checkpoint\.pt is damaged; remove it"):
+        train(windows, small, tmp_path, progress=False)
+
+
+def test_bad_requests_leave_no_folder(windows, small, tmp_path):
+    with pytest.raises(InputError, match="unknown trait method"):
+        train(windows, small, tmp_path / "run", method="theirs", progress=False)
+    nothing = replace(windows, **{name: value[:0] for name, value in vars(windows).items()})
+    with pytest.raises(InputError, match="no windows to train on"):
+        train(nothing, small, tmp_path / "run", progress=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_progress_goes_to_stderr(windows, small, tmp_path, capsys):
+    train(windows, small, tmp_path, progress=True)
+    shown = capsys.readouterr()
+    assert "traits ours" in shown.err
+    assert shown.out == ""
+
+
+def test_large_networks_train_in_bfloat16(windows, small, tmp_path):
+    settings = replace(small, hidden_size=training.BFLOAT16_HIDDEN_SIZE, epochs=1)
+    model = train(windows, settings, tmp_path, progress=False)
+    assert all(value.dtype == torch.float32 and value.isfinite().all() for value in model.state_dict().values())
+
+
+def two_populations(drivers):
+    """Drivers at about 2.4 and 3.0 m/s behind leaders at any distance, and who is of the slow ones."""
+    generator = np.random.default_rng(2)
+    slow = generator.random(drivers) < 0.5
+    speed_mps = np.where(slow, 2.4, 3.0) + generator.normal(scale=0.05, size=drivers)
+    offset = speed_mps[:, None] * 0.1 * np.arange(20)
+    gap = np.broadcast_to(generator.uniform(3.0, 12.0, size=(drivers, 1)), offset.shape)
+    windows = Windows(
+        states=np.stack((offset, gap), axis=2).astype(np.float32),
+        length=np.full(drivers, 20),
+        driver=np.arange(drivers),
+        episode=np.arange(drivers) // 10,
+        has_leader=np.ones(drivers, dtype=bool),
+    )
+    return windows, slow
+
+
+def test_two_populations_separate_without_labels(small, tmp_path):
+    windows, slow = two_populations(1000)
+    model = train(windows, replace(small, hidden_size=16, learning_rate=1e-2, epochs=8), tmp_path, progress=False)
+    assert evaluate(model, windows, slow).accuracy > 0.95

@@ -1,0 +1,101 @@
+import math
+
+import pytest
+import torch
+
+from tint_sumo.traits.model import valid_steps
+from tint_sumo.traits.vae import Vae, kl_divergence
+
+
+@pytest.fixture
+def batch(street) -> tuple[torch.Tensor, torch.Tensor]:
+    """64 windows of many lengths."""
+    windows, _ = street
+    order = windows.length.argsort(kind="stable")[:64]
+    return torch.from_numpy(windows.states[order]), torch.from_numpy(windows.length[order])
+
+
+@pytest.fixture
+def model(small, batch) -> Vae:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = Vae(small)
+    model.fit_features(*batch)
+    return model.eval()
+
+
+def loss_terms(model, states, length) -> dict[str, float]:
+    return {name: term.item() for name, term in model.loss(states, length, torch.Generator().manual_seed(3)).items()}
+
+
+@pytest.mark.parametrize("rubbish", [1e6, math.nan])
+def test_steps_after_the_length_have_no_influence(model, batch, rubbish):
+    states, length = batch
+    spoilt = states.clone()
+    spoilt[~valid_steps(states, length)] = rubbish
+    for clean, dirty in zip(model.encode(states, length), model.encode(spoilt, length), strict=True):
+        assert torch.equal(clean, dirty)
+    assert loss_terms(model, states, length) == loss_terms(model, spoilt, length)
+    refitted = Vae(model.settings)
+    refitted.fit_features(spoilt, length)
+    assert torch.equal(refitted.feature_scale, model.feature_scale)
+
+
+def test_every_valid_step_has_influence(model, batch):
+    states, length = batch
+    last = torch.arange(len(length)), length - 1
+    changed = states.clone()
+    changed[last] += 1.0
+    before, after = model.encode(states, length)[0], model.encode(changed, length)[0]
+    assert torch.all((before - after).abs().amax(dim=1) > 1e-6)
+
+
+def test_a_window_is_encoded_the_same_in_any_company(model, batch):
+    states, length = batch
+    together, _ = model.encode(states, length)
+    order = torch.randperm(len(length), generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(model.encode(states[order], length[order])[0], together[order], atol=1e-6)
+    for window in (0, 63):
+        steps = int(length[window])
+        alone, _ = model.encode(states[window : window + 1, :steps], length[window : window + 1])
+        assert torch.allclose(alone[0], together[window], atol=1e-6)
+
+
+def test_decoder_sees_its_own_reconstruction_and_the_latent_at_every_step(model):
+    latent = torch.randn(5, 2, generator=torch.Generator().manual_seed(0))
+    state, hidden, expected = torch.full((5, 2), -2.0), torch.zeros(5, 8), []
+    weight = torch.cat((model.decoder_state_input.weight, model.decoder_latent_input.weight), dim=1)
+    for _ in range(4):
+        joined = torch.cat((state, latent), dim=1)
+        embedded = model.decoder_embed(joined @ weight.T + model.decoder_latent_input.bias)
+        hidden = model.decoder(embedded, hidden)
+        state = model.decoder_output(hidden)
+        expected.append(state)
+    assert torch.allclose(model.decode(latent, 4), torch.stack(expected, dim=1), atol=1e-6)
+
+
+def test_kl_divergence_against_a_computation_by_hand():
+    # KL(N(m, s^2) || N(0, 1)) = (m^2 + s^2 - 1) / 2 - ln s: here (4 + 9 - 1) / 2 - ln 3, and 0 for the prior itself.
+    mean, log_var = torch.tensor([[2.0, 0.0], [0.0, 0.0]]), torch.tensor([[math.log(9.0), 0.0], [0.0, 0.0]])
+    assert kl_divergence(mean, log_var).tolist() == pytest.approx([6.0 - math.log(3.0), 0.0])
+
+
+def test_loss_is_the_weighted_sum_of_its_terms_over_valid_steps(model, batch, monkeypatch):
+    states, length = batch
+    monkeypatch.setattr(model, "decode", lambda latent, steps: torch.zeros(len(latent), steps, 2))
+    terms = loss_terms(model, states, length)
+    features = model.features(states, length)
+    assert terms["reconstruction"] == pytest.approx((features.square().sum() / (2 * length.sum())).item(), rel=1e-5)
+    assert terms["kl"] == pytest.approx(kl_divergence(*model.encode(states, length)).mean().item(), rel=1e-5)
+    settings = model.settings
+    weighted = settings.kl_weight * terms["kl"] + settings.reconstruction_weight * terms["reconstruction"]
+    assert terms["total"] == pytest.approx(weighted)
+
+
+def test_latent_noise_comes_from_the_generator_alone(model, batch):
+    torch.manual_seed(1)
+    first = loss_terms(model, *batch)
+    torch.manual_seed(2)
+    assert loss_terms(model, *batch) == first
+    other = model.loss(*batch, torch.Generator().manual_seed(4))["reconstruction"].item()
+    assert other != first["reconstruction"]

@@ -1,0 +1,127 @@
+"""Trait models as files: NAME.safetensors with the weights and NAME.json, the card that says what they are."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+from safetensors import SafetensorError
+
+from tint_sumo.config import VaeSettings
+from tint_sumo.errors import InputError
+from tint_sumo.files import read_json, shipped, whole_file, write_json
+from tint_sumo.traits.model import METHODS, TraitModel
+
+RUN_MODEL = "model"  # name of the model in the folder of a training run
+
+
+def save(model: TraitModel, stem: Path, card: Mapping[str, Any]) -> None:
+    """Write ``stem``.safetensors and ``stem``.json.
+
+    The card holds method, settings and latent size of the model, and whatever else ``card`` says about it (data, seed,
+    accuracy). It is written last, so that where there is a card there are weights.
+    """
+    with whole_file(_weights_file(stem)) as partial:
+        safetensors.torch.save_file(model.state_dict(), partial)
+    described = {"method": model.method, "latent_size": model.latent_size, "settings": asdict(model.settings)}
+    write_json(_card_file(stem), {**card, **described})
+
+
+def load(name_or_path: str | Path, latent_size: int | None = None) -> TraitModel:
+    """A trained model in evaluation mode, its weights frozen.
+
+    Args:
+        name_or_path: name of a shipped model, folder of a training run, or path of a .safetensors file.
+        latent_size: the number of latents the caller needs; None accepts any.
+
+    Raises:
+        InputError: there is no such model, its files are missing or damaged, the card does not fit the weights, or
+            the latent size is another.
+    """
+    stem = find(name_or_path)
+    card = _checked_card(stem)
+    if latent_size is not None and card["latent_size"] != latent_size:
+        raise InputError(
+            f"trait model {name_or_path} has {card['latent_size']} latents where {latent_size} are needed; "
+            "use a model trained with that latent size"
+        )
+    model = _build(card, stem)
+    try:
+        weights = safetensors.torch.load_file(_weights_file(stem))
+        model.load_state_dict(weights)
+    except (OSError, SafetensorError):
+        raise InputError(f"{_weights_file(stem)} is damaged; train the model again or restore the file") from None
+    except RuntimeError:
+        raise InputError(
+            f"{_card_file(stem)} does not fit the weights beside it; restore both files of the model"
+        ) from None
+    return model.eval().requires_grad_(False)
+
+
+def read_card(name_or_path: str | Path) -> dict[str, Any]:
+    """The card of a model, found as in ``load``."""
+    return _checked_card(find(name_or_path))
+
+
+def add_to_card(name_or_path: str | Path, entries: Mapping[str, Any]) -> None:
+    """Add what was found out about a saved model, such as its accuracy, to its card."""
+    stem = find(name_or_path)
+    write_json(_card_file(stem), {**_checked_card(stem), **entries})
+
+
+def find(name_or_path: str | Path) -> Path:
+    """The path of a model without its suffixes.
+
+    Raises:
+        InputError: there is no such model.
+    """
+    given = Path(name_or_path)
+    weights = given.with_suffix("") if given.suffix == ".safetensors" else given
+    for stem in (shipped("models") / given, given / RUN_MODEL, weights):
+        if stem.name and _weights_file(stem).is_file():
+            return stem
+    known = sorted(file.stem for file in shipped("models").glob("*.safetensors") if _is_trait_model(file))
+    raise InputError(
+        f"no trait model {name_or_path}; give the folder of a training run, a .safetensors file, "
+        f"or a shipped model ({', '.join(known) or 'none is shipped'})"
+    )
+
+
+def _is_trait_model(weights: Path) -> bool:
+    try:
+        _checked_card(weights.with_suffix(""))
+    except InputError:
+        return False
+    return True
+
+
+def _checked_card(stem: Path) -> dict[str, Any]:
+    card = read_json(_card_file(stem), "card of the trait model")
+    method, latent_size, settings = (card.get(key) for key in ("method", "latent_size", "settings"))
+    if method not in METHODS or not isinstance(latent_size, int) or not isinstance(settings, dict):
+        raise InputError(
+            f"{_card_file(stem)} is not the card of a trait model (methods: {', '.join(sorted(METHODS))}); "
+            "restore the file or train the model again"
+        )
+    return card
+
+
+def _build(card: Mapping[str, Any], stem: Path) -> TraitModel:
+    settings: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"].items()
+    }
+    try:
+        return METHODS[card["method"]](VaeSettings(**settings), card["latent_size"])
+    except (TypeError, ValueError, RuntimeError, IndexError) as error:
+        raise InputError(
+            f"{_card_file(stem)}: unusable settings ({error}); restore the file or train the model again"
+        ) from None
+
+
+def _weights_file(stem: Path) -> Path:
+    return stem.with_name(stem.name + ".safetensors")
+
+
+def _card_file(stem: Path) -> Path:
+    return stem.with_name(stem.name + ".json")

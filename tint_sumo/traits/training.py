@@ -1,0 +1,183 @@
+"""Training of a trait model on windows, without labels; interruptible and exactly resumable."""
+
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from tint_sumo.config import LATENT_SIZE, VaeSettings
+from tint_sumo.dataset.windows import Windows
+from tint_sumo.errors import InputError
+from tint_sumo.files import claim_folder, whole_file
+from tint_sumo.traits.model import TraitModel, find_method
+from tint_sumo.traits.storage import RUN_MODEL, load, save
+
+CHECKPOINT_FILE = "checkpoint.pt"
+CHECKPOINT_INTERVAL_S = 10.0
+BFLOAT16_HIDDEN_SIZE = 64  # from this size on bfloat16 is the faster one on CPUs
+
+
+def train(
+    windows: Windows,
+    settings: VaeSettings,
+    out: Path,
+    *,
+    method: str = "ours",
+    seed: int = 0,
+    latent_size: int = LATENT_SIZE,
+    progress: bool = True,
+    card: Mapping[str, Any] | None = None,
+) -> TraitModel:
+    """Train ``method`` on all of ``windows`` and write model.safetensors and model.json into ``out``.
+
+    An interrupted run leaves a checkpoint; the same call continues it and ends with the very weights of a run without
+    interruption (on the same machine and number of threads). A finished run is loaded, not repeated.
+
+    Args:
+        windows: training windows only; the caller keeps the test episodes out.
+        settings: sizes, loss weights and schedule.
+        out: a new folder, or the one of this very run.
+        method: a name in ``METHODS``.
+        seed: of the initial weights, the order of windows and the latent noise.
+        latent_size: numbers that represent a trait.
+        progress: show a progress bar on stderr.
+        card: what else the model's card shall say, such as where the windows come from.
+
+    Returns:
+        The trained model in evaluation mode.
+
+    Raises:
+        InputError: unknown method, no windows, ``out`` holds another run, or its checkpoint is damaged.
+    """
+    model_type = find_method(method)
+    if len(windows.length) == 0:
+        raise InputError("there are no windows to train on; record a dataset with more of them")
+    identity = {
+        "task": "traits train",
+        "method": method,
+        "seed": seed,
+        "latent_size": latent_size,
+        "settings": asdict(settings),
+        "windows": len(windows.length),
+        "windows_sha256": _digest(windows),
+    }
+    claim_folder(out, identity)
+    if (out / f"{RUN_MODEL}.json").exists():
+        return load(out / f"{RUN_MODEL}.safetensors")  # the folder alone could be the name of a shipped model
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(_stream_seed(seed, 0))
+        model = model_type(settings, latent_size)
+    run = _Run(model, torch.from_numpy(windows.states), torch.from_numpy(windows.length), settings, seed)
+    loss = run.fit(out / CHECKPOINT_FILE, progress)
+
+    known = {key: identity[key] for key in ("seed", "windows", "windows_sha256")}
+    save(model, out / RUN_MODEL, {**known, "loss": loss, **(card or {})})
+    (out / CHECKPOINT_FILE).unlink(missing_ok=True)
+    return model.eval().requires_grad_(False)
+
+
+class _Run:
+    """One training run: a model, its windows as tensors, and the optimiser."""
+
+    def __init__(self, model: TraitModel, states: Tensor, length: Tensor, settings: VaeSettings, seed: int) -> None:
+        self.model = model
+        self.states = states
+        self.length = length
+        self.settings = settings
+        self.seed = seed
+        self.optimiser = torch.optim.Adam(
+            model.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
+        )
+
+    def fit(self, checkpoint: Path, progress: bool) -> dict[str, float]:
+        """Run all epochs, beginning after those in ``checkpoint``; the mean loss terms of the last epoch.
+
+        Each epoch draws from a generator of its own, so a checkpoint needs no generator states.
+        """
+        self.model.fit_features(self.states, self.length)
+        done, loss = self._resume(checkpoint)
+        saved_at = time.monotonic()
+        with self._bar(done, progress) as bar:
+            for epoch in range(done, self.settings.epochs):
+                loss = self._run_epoch(epoch, bar)
+                bar.set_postfix({name: f"{value:.4g}" for name, value in loss.items()})
+                if time.monotonic() - saved_at >= CHECKPOINT_INTERVAL_S:
+                    self._write_checkpoint(checkpoint, epoch + 1, loss)
+                    saved_at = time.monotonic()
+        return loss
+
+    def _bar(self, done: int, progress: bool) -> "tqdm[NoReturn]":
+        windows = len(self.length)
+        return tqdm(
+            desc=f"traits {self.model.method}",
+            total=self.settings.epochs * windows,
+            initial=done * windows,
+            unit="window",
+            unit_scale=True,
+            disable=not progress,
+        )
+
+    def _run_epoch(self, epoch: int, bar: "tqdm[NoReturn]") -> dict[str, float]:
+        """One pass over the shuffled windows; the mean of each loss term over the batches."""
+        generator = torch.Generator().manual_seed(_stream_seed(self.seed, 1 + epoch))
+        order = torch.randperm(len(self.length), generator=generator)
+        starts = range(0, len(order), self.settings.batch_size)
+        sums: dict[str, float] = {}
+        for index, start in enumerate(starts):
+            batch = order[start : start + self.settings.batch_size]
+            terms = self._step(batch, 1.0 - (epoch + index / len(starts)) / self.settings.epochs, generator)
+            for name, value in terms.items():
+                sums[name] = sums.get(name, 0.0) + value
+            bar.update(len(batch))
+        return {name: value / len(starts) for name, value in sums.items()}
+
+    def _step(self, batch: Tensor, remaining: float, generator: torch.Generator) -> dict[str, float]:
+        """One gradient step at the fraction ``remaining`` of the learning rate; the loss terms."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.settings.learning_rate * remaining
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.settings.hidden_size >= BFLOAT16_HIDDEN_SIZE):
+            terms = self.model.loss(self.states[batch], self.length[batch], generator)
+        self.optimiser.zero_grad()
+        torch.autograd.backward(terms["total"])
+        self.optimiser.step()
+        return {name: value.item() for name, value in terms.items()}
+
+    def _resume(self, checkpoint: Path) -> tuple[int, dict[str, float]]:
+        """Take over ``checkpoint`` if there is one; the number of finished epochs and the last one's loss terms."""
+        if not checkpoint.exists():
+            return 0, {}
+        try:
+            state = torch.load(checkpoint, weights_only=True)
+            self.model.load_state_dict(state["model"])
+            self.optimiser.load_state_dict(state["optimiser"])
+            return state["epochs"], state["loss"]
+        except Exception:  # torch.load raises a different type for each kind of damage
+            raise InputError(f"{checkpoint} is damaged; remove it to train from the beginning") from None
+
+    def _write_checkpoint(self, checkpoint: Path, epochs: int, loss: dict[str, float]) -> None:
+        state = {
+            "epochs": epochs,
+            "loss": loss,
+            "model": self.model.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+        }
+        with whole_file(checkpoint) as partial:
+            torch.save(state, partial)
+
+
+def _stream_seed(seed: int, stream: int) -> int:
+    return int(np.random.SeedSequence((seed, stream)).generate_state(1)[0])
+
+
+def _digest(windows: Windows) -> str:
+    digest = hashlib.sha256(np.ascontiguousarray(windows.states).tobytes())
+    digest.update(np.ascontiguousarray(windows.length).tobytes())
+    return digest.hexdigest()

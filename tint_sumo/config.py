@@ -184,11 +184,16 @@ class PolicySettings:
     joint_sizes: tuple[int, ...] = (150, 100, 64)  # code
     hidden_size: int = 256  # code
     head_sizes: tuple[int, ...] = (256, 256)  # code
+    position_gain: float = 1.0  # positions are multiplied by this; observed in units of 20 m, they differ by little
 
 
 @dataclass(frozen=True)
 class PpoSettings:
-    """PPO as in the paper (IV-C) and its code; ``n_steps`` and ``n_envs`` set the batch."""
+    """PPO as in the paper (IV-C) and its code; ``n_steps`` and ``n_envs`` set the batch.
+
+    With ``action_repeat`` above 1 the policy decides only every so many simulation steps; ``n_steps``, ``gamma`` and
+    ``total_steps`` then count decisions.
+    """
 
     n_envs: int = 12  # paper
     n_steps: int = 30  # paper
@@ -203,3 +208,4 @@ class PpoSettings:
     max_grad_norm: float = 0.5
     total_steps: int = 10_000_000  # paper
     policy: PolicySettings = field(default_factory=PolicySettings)
+    action_repeat: int = 1  # paper: a decision every step

@@ -1,10 +1,12 @@
 """The navigation policy: attention and a GRU, trained with PPO on observations with driver traits."""
 
+from tint_sumo.policy.action_repeat import ActionRepeat
 from tint_sumo.policy.network import AttentionExtractor, GruPolicy
 from tint_sumo.policy.ppo import RecurrentPPO
 from tint_sumo.policy.trait_observation import EncoderTraits, NoTraits, OracleTraits, TraitObservation, TraitSource
 
 __all__ = [
+    "ActionRepeat",
     "AttentionExtractor",
     "EncoderTraits",
     "GruPolicy",

@@ -46,9 +46,7 @@ class _Recurrence(torch.autograd.Function):
     """The part of a GRU that must go step by step: state and gates as precise as the state, products as the weight."""
 
     @staticmethod
-    def forward(  # noqa: PLR0917
-        ctx: Any, projected: Tensor, hidden: Tensor, keep: Tensor, weight: Tensor, bias: Tensor
-    ) -> Tensor:
+    def forward(ctx: Any, projected: Tensor, hidden: Tensor, keep: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         size = weight.shape[1]
         gates = torch.empty_like(projected[..., : 2 * size])  # reset and update
         candidates = torch.empty_like(projected[..., :size])

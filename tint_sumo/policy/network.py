@@ -62,6 +62,7 @@ class AttentionExtractor(BaseFeaturesExtractor):
             )
         ego_size, position_size, trait_size = (_last_axis(observation_space, k) for k in ("ego", "vehicles", "traits"))
         embedded = settings.embedding_sizes[-1]
+        self.position_gain = settings.position_gain
         self.embed = _mlp(position_size + trait_size + ego_size, *settings.embedding_sizes)
         self.score = nn.Sequential(*_mlp(2 * embedded, *settings.score_sizes), nn.Linear(settings.score_sizes[-1], 1))
         self.context = _mlp(embedded, settings.context_size)
@@ -69,7 +70,7 @@ class AttentionExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
         """Features (B, features_dim) of B observations."""
-        ego = observations["ego"]
+        ego = self._gained_ego(observations)
         slots, rows, embedded = self._embed_vehicles(observations)
         weights = self._weights(observations["mask"], slots, rows, embedded)
         chosen = weights.flatten().index_select(0, slots).unsqueeze(-1)
@@ -81,13 +82,17 @@ class AttentionExtractor(BaseFeaturesExtractor):
         """Attention weights (B, V): they sum to 1 over the vehicles and are 0 in empty slots."""
         return self._weights(observations["mask"], *self._embed_vehicles(observations))
 
+    def _gained_ego(self, observations: dict[str, Tensor]) -> Tensor:
+        position, velocity = observations["ego"][..., :2], observations["ego"][..., 2:]
+        return torch.cat([position * self.position_gain, velocity], dim=-1)
+
     def _embed_vehicles(self, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """The R real vehicles of a batch: flat slot index (R,), batch index (R,), embedding (R, embedded)."""
         rows, columns = _real(observations["mask"]).nonzero(as_tuple=True)
         slots = rows * observations["mask"].shape[-1] + columns
-        positions = observations["vehicles"].flatten(0, 1).index_select(0, slots)
+        positions = observations["vehicles"].flatten(0, 1).index_select(0, slots) * self.position_gain
         traits = observations["traits"].flatten(0, 1).index_select(0, slots)
-        ego = observations["ego"].index_select(0, rows)
+        ego = self._gained_ego(observations).index_select(0, rows)
         return slots, rows, self.embed(torch.cat([positions, traits, ego], dim=-1))
 
     def _weights(self, mask: Tensor, slots: Tensor, rows: Tensor, embedded: Tensor) -> Tensor:

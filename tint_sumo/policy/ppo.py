@@ -229,7 +229,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
             "clip_fraction": ((ratio - 1.0).abs() > self.clip_range).float().mean().item(),
         }
 
-    def learn(  # noqa: PLR0917
+    def learn(
         self,
         total_timesteps: int,
         callback: MaybeCallback = None,

@@ -1,0 +1,47 @@
+import numpy as np
+import pytest
+
+from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.errors import InputError
+from tint_sumo.policy import ActionRepeat
+
+GO, STOP = 2, 0
+
+
+def test_a_decision_is_so_many_steps_and_the_sum_of_their_rewards() -> None:
+    plain, repeated = TIntersectionVecEnv(3, seed=0), ActionRepeat(TIntersectionVecEnv(3, seed=0, backend="traci"), 4)
+    plain.reset()
+    repeated.reset()
+    for action in (GO, STOP, GO):
+        actions = np.full(3, action)
+        rewards = sum(plain.step(actions)[1] for _ in range(3))
+        expected, reward, done, _ = plain.step(actions)
+        observation, total, ended, _ = repeated.step(actions)
+        np.testing.assert_allclose(total, rewards + reward, rtol=1e-5)
+        assert not (done | ended).any()
+        for key, value in expected.items():
+            np.testing.assert_array_equal(observation[key], value)
+    plain.close()
+    repeated.close()
+
+
+def test_an_episode_ends_the_decision_and_the_next_one_waits() -> None:
+    venv = ActionRepeat(TIntersectionVecEnv(2, seed=0, time_limit_s=0.6), 4)
+    venv.reset()
+    assert not venv.step(np.full(2, GO))[2].any()
+    observation, rewards, done, infos = venv.step(np.full(2, GO))
+    assert done.all()
+    assert infos[0]["outcome"] == "timeout"
+    assert infos[0]["TimeLimit.truncated"]
+    assert infos[0]["terminal_observation"]["ego"][1] > -0.25  # had driven
+    np.testing.assert_allclose(observation["ego"], [[0.0, -0.25, 0.0, 0.0]] * 2)  # the fresh ego has not
+    speeds_mps = np.array([1.5, 1.8])  # of the last two steps: 3 m/s2 from standing
+    assert rewards[0] == pytest.approx((0.05 * speeds_mps - 0.0013).sum(), abs=1e-5)
+    venv.close()
+
+
+def test_at_least_one_step() -> None:
+    venv = TIntersectionVecEnv(1)
+    with pytest.raises(InputError, match="at least 1 step, not 0"):
+        ActionRepeat(venv, 0)
+    venv.close()

@@ -23,7 +23,7 @@ def save(model: TraitModel, stem: Path, card: Mapping[str, Any]) -> None:
     accuracy). It is written last, so that where there is a card there are weights.
     """
     with whole_file(_weights_file(stem)) as partial:
-        safetensors.torch.save_file(model.state_dict(), partial)
+        partial.write_bytes(safetensors.torch.save(model.state_dict()))  # save_file would make it unreadable to others
     described = {"method": model.method, "latent_size": model.latent_size, "settings": asdict(model.settings)}
     write_json(_card_file(stem), {**card, **described})
 

@@ -1,0 +1,75 @@
+"""The package as users install it."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*build, "--wheel-dir", str(folder), str(ROOT)], check=True)
+    return next(folder.glob("*.whl"))
+
+
+def test_the_wheel_holds_network_models_and_type_marker(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for file in (ROOT / "sumo_net").iterdir():
+        assert f"tint_sumo/shipped/sumo_net/{file.name}" in names
+    for file in (ROOT / "data" / "models").iterdir():
+        assert f"tint_sumo/shipped/models/{file.name}" in names
+    assert {"tint_sumo/py.typed", "tint_sumo.pth"} <= names
+
+
+def test_an_installed_wheel_works_away_from_the_checkout(wheel: Path, tmp_path: Path) -> None:
+    """As site-packages would hold it, with the dependencies of this environment."""
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    code = f"""
+import sys
+sys.path = [path for path in sys.path if path != {str(ROOT)!r}]
+for name in [name for name in sys.modules if name.split(".")[0] == "tint_sumo"]:
+    del sys.modules[name]
+sys.meta_path = [finder for finder in sys.meta_path if type(finder).__module__ != "tint_sumo"]
+import site
+site.addsitedir({str(tmp_path / "site")!r})
+import gymnasium
+env = gymnasium.make("tint_sumo/TIntersection-v0")
+env.reset(seed=0)
+import tint_sumo.files, tint_sumo.traits
+assert tint_sumo.__file__.startswith({str(tmp_path)!r}), tint_sumo.__file__
+assert str(tint_sumo.files.shipped("models")).startswith({str(tmp_path)!r})
+assert (tint_sumo.files.shipped("sumo_net") / "tint.net.xml").exists()
+print(tint_sumo.traits.load("ours").latent_size)
+"""
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == "2"
+
+
+def test_importing_the_package_is_cheap() -> None:
+    """tint_sumo.pth imports it whenever Python starts."""
+    code = "import sys, tint_sumo; print(*sorted(sys.modules))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"gymnasium", "numpy", "torch", "libsumo", "pandas", "asyncio"} & set(loaded)
+
+
+def test_floors_import_downwards_only() -> None:
+    floors = ["config errors files", "scenario", "simulation", "envs dataset", "traits", "policy", "study", "cli"]
+    floor_of = {name: level for level, names in enumerate(floors) for name in names.split()}
+    package = ROOT / "tint_sumo"
+    for file in package.rglob("*.py"):
+        own = file.relative_to(package).parts[0].removesuffix(".py")
+        if own == "__init__":
+            continue
+        for line in file.read_text().splitlines():
+            words = line.split()
+            if words[:1] in (["from"], ["import"]) and words[1].startswith("tint_sumo."):
+                other = words[1].split(".")[1]
+                assert floor_of[other] <= floor_of[own], f"{file}: {line.strip()}"
+                assert other == own or floor_of[other] < floor_of[own] or floor_of[own] == 0, f"{file}: {line.strip()}"

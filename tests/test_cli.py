@@ -1,0 +1,336 @@
+"""The command line from the outside: in-process where that shows the same, as a subprocess for signals."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tint_sumo import traits
+from tint_sumo.cli import main
+from tint_sumo.config import VaeSettings
+from tint_sumo.dataset.recorder import record
+from tint_sumo.study.methods import METHODS, Learned
+from tint_sumo.study.results import RESULTS
+from tint_sumo.traits.storage import save
+
+PATIENCE_S = 100.0
+COMMANDS = (
+    "net",
+    "record",
+    "traits train",
+    "traits evaluate",
+    "policy train",
+    "policy evaluate",
+    "study run",
+    "study report",
+)
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data") / "dataset"
+    record(folder, 100, workers=2, progress=False)  # in other processes: this one's libsumo stays free
+    return folder
+
+
+@pytest.fixture(scope="session")
+def trait_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trait model nobody trained."""
+    torch.manual_seed(0)
+    settings = VaeSettings(embedding_sizes=(8, 8), hidden_size=8, encoder_output_size=8, decoder_output_size=8)
+    folder = tmp_path_factory.mktemp("model")
+    save(traits.METHODS["ours"](settings), folder / "model", {"seed": 0})
+    save(traits.METHODS["ours"](settings, latent_size=3), folder / "wide", {"seed": 0})
+    return folder / "model.safetensors"
+
+
+def files(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def run(capsys: pytest.CaptureFixture[str], *argv: Any) -> dict[str, Any]:
+    """A command that must succeed; the object it prints last."""
+    assert main([*map(str, argv), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert isinstance(printed, dict)
+    return printed
+
+
+def refuse(capsys: pytest.CaptureFixture[str], *argv: Any) -> str:
+    """A command that must be refused; the line it prints."""
+    assert main([*map(str, argv)]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    lines = printed.err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("tint-sumo: error: ")
+    return lines[0]
+
+
+# Help and arguments
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_and_json(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*command.split(), "--help"])
+    assert stop.value.code == 0
+    assert "--json" in capsys.readouterr().out
+
+
+def test_help_is_quick() -> None:
+    script = (
+        "import sys, tint_sumo.cli\n"
+        "try: tint_sumo.cli.main(['policy', 'train', '--help'])\n"
+        "except SystemExit: print([name for name in ('torch', 'pandas', 'libsumo', 'sklearn') if name in sys.modules])"
+    )
+    printed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert printed.splitlines()[-1] == "[]"
+
+
+def test_help_names_the_learned_methods(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["policy", "train", "--help"])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert all(name in printed for name, method in METHODS.items() if isinstance(method, Learned))
+
+
+@pytest.mark.parametrize(
+    "argv", [[], ["fly"], ["record"], ["policy", "evaluate", "--model", "ttc", "--episodes", "many"], ["net", "--x"]]
+)
+def test_argument_errors_exit_with_2(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(argv)
+    assert stop.value.code == 2
+    assert capsys.readouterr().out == ""
+
+
+# What the commands do
+
+
+def test_net(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    printed = run(capsys, "net", "--out", tmp_path / "net", "--replicas", 2)
+    assert printed["replicas"] == 2
+    assert {Path(file).name for file in printed["files"]} >= {"tint.net.xml", "tint.sumocfg"}
+    assert all(Path(file).is_file() for file in printed["files"])
+
+
+def test_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "data"
+    printed = run(capsys, "record", "--out", out, "--windows", 50, "--p-conservative", 0.3, "--seed", 4, "--workers", 2)
+    assert printed["windows"] >= 50
+    assert (printed["p_conservative"], printed["seed"]) == (0.3, 4)
+    assert json.loads((out / "manifest.json").read_text()) == printed
+
+
+def test_traits(dataset: Path, tmp_path: Path, trait_model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    figure = tmp_path / "latent.png"
+    printed = run(capsys, "traits", "evaluate", "--data", dataset, "--model", trait_model, "--figure", figure)
+    assert 0.0 <= printed["accuracy"] <= 1.0
+    assert 0 < printed["windows"] < json.loads((dataset / "manifest.json").read_text())["windows"]
+    assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+def test_policy_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
+    printed = run(capsys, "policy", "evaluate", "--model", "always_go", "--episodes", 6, "--p-conservative", 0.9)
+    assert printed["success"] + printed["collision"] + printed["timeout"] == pytest.approx(1.0)
+    assert (printed["model"], printed["episodes"], printed["seed"]) == ("always_go", 6, 0)
+    assert printed["p_conservative"] == 0.9
+    assert "navigation_time_s" in printed
+    low, high = printed["intervals"]["success"]
+    assert low <= printed["success"] <= high
+
+
+def test_policy_train(tmp_path: Path, trait_model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    argv = ("policy", "train", "--method", "ours", "--steps", 1, "--traits", trait_model, "--out", out)
+    printed = run(capsys, *argv, "--p-conservative", 0.25)
+    assert printed == {
+        "model": str(out / "policy.zip"), "method": "ours", "p_conservative": 0.25, "steps": 1, "seed": 0
+    }  # fmt: skip
+    before = files(out)
+    assert "another run" in refuse(capsys, *argv, "--p-conservative", 0.3)
+    assert files(out) == before
+    found = run(capsys, "policy", "evaluate", "--model", out, "--episodes", 2)
+    assert found["p_conservative"] == 0.25
+
+
+def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    case = ["success", 12.0, None, None]
+    result = {"method": "ttc", "p_conservative": 0.4, "seed": 0, "cases": [case] * 3}
+    (tmp_path / RESULTS).mkdir()
+    (tmp_path / RESULTS / "one.json").write_text(json.dumps(result))
+    printed = run(capsys, "study", "report", "--out", tmp_path)
+    assert [(row["method"], row["success"]) for row in printed["results"]] == [("ttc", 1.0)]
+    assert all(Path(printed[kind]).is_file() for kind in ("csv", "markdown", "figure"))
+    assert main(["study", "report", "--out", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "| time to collision |" in text
+    assert all(f"wrote {printed[kind]}" in text for kind in ("csv", "markdown", "figure"))
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("net --replicas 0 --out OUT", "replicas"),
+        ("record --p-conservative 1.5 --out OUT", "p_conservative"),
+        ("record --windows 0 --out OUT", "windows"),
+        ("record --seed -1 --out OUT", "seed"),
+        ("traits train --data NOWHERE --out OUT", "dataset"),
+        ("traits train --data DATA --method magic --out OUT", "unknown trait method 'magic'"),
+        ("traits train --data DATA --seed -1 --out OUT", "seed"),
+        ("traits evaluate --data NOWHERE --model MODEL", "dataset"),
+        ("traits evaluate --data DATA --model nobody", "no trait model nobody"),
+        ("policy train --method magic --out OUT", "unknown method 'magic'"),
+        ("policy train --method ttc --out OUT", "hand-written rule"),
+        ("policy train --method oracle --p-conservative -0.1 --out OUT", "p_conservative"),
+        ("policy train --method oracle --steps 0 --out OUT", "steps"),
+        ("policy train --method ours --traits nobody --out OUT", "no trait model nobody"),
+        ("policy train --method ours --traits WIDE --out OUT", "3 latents where 2 are needed"),
+        ("policy evaluate --model nobody", "no policy nobody"),
+        ("policy evaluate --model ttc --p-conservative 2", "p_conservative"),
+        ("policy evaluate --model ttc --episodes 0", "episodes"),
+        ("policy evaluate --model ttc --seed -1", "seed"),
+        ("study run --workers 0 --out OUT", "workers"),
+        ("study report --out NOWHERE", "no results in"),
+    ],
+)
+def test_bad_values(
+    argv: str, message: str, dataset: Path, trait_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = {
+        "OUT": tmp_path / "out",
+        "NOWHERE": tmp_path / "nowhere",
+        "DATA": dataset,
+        "MODEL": trait_model,
+        "WIDE": trait_model.with_stem("wide"),
+    }
+    before = files(dataset)
+    assert message in refuse(capsys, *(places.get(word, word) for word in argv.split()))
+    assert not any(tmp_path.iterdir())
+    assert files(dataset) == before
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        "record",
+        "traits train --data DATA",
+        "policy train --method oracle",
+        "study run",
+    ],
+)
+def test_a_folder_with_other_files_is_left_alone(
+    argv: str, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "precious.txt").write_text("mine")
+    words = (dataset if word == "DATA" else word for word in argv.split())
+    assert "already holds other files" in refuse(capsys, *words, "--out", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]
+
+
+@pytest.mark.parametrize("argv", ["record", "policy train --method oracle", "study run", "net"])
+def test_a_file_is_no_folder(argv: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "file"
+    out.write_text("mine")
+    assert "choose another --out" in refuse(capsys, *argv.split(), "--out", out)
+    assert "file" in refuse(capsys, *argv.split(), "--out", out / "below")
+    assert out.read_text() == "mine"
+
+
+def copy(source: Path, target: Path) -> Path:
+    for path, content in files(source).items():
+        to = target / path.relative_to(source)
+        to.parent.mkdir(parents=True, exist_ok=True)
+        to.write_bytes(content)
+    return target
+
+
+def test_a_dataset_of_another_schema_version(
+    dataset: Path, trait_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = copy(dataset, tmp_path / "other")
+    manifest = json.loads((other / "manifest.json").read_text())
+    (other / "manifest.json").write_text(json.dumps({**manifest, "schema_version": 99}))
+    for argv in (("evaluate", "--model", trait_model), ("train", "--out", tmp_path / "out")):
+        assert "schema version 99" in refuse(capsys, "traits", *argv, "--data", other)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_dataset(
+    dataset: Path, trait_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = copy(dataset, tmp_path / "other")
+    shard = next((other / "trajectories").iterdir())
+    shard.write_bytes(shard.read_bytes()[:100])
+    assert "damaged" in refuse(capsys, "traits", "evaluate", "--model", trait_model, "--data", other)
+
+
+def test_damaged_models(dataset: Path, trait_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    broken = copy(trait_model.parent, tmp_path / "broken")
+    (broken / "model.safetensors").write_bytes(b"nonsense")
+    assert "damaged" in refuse(capsys, "traits", "evaluate", "--data", dataset, "--model", broken)
+    (tmp_path / "policy.zip").write_bytes(b"nonsense")
+    (tmp_path / "policy.json").write_text(
+        json.dumps({"method": "oracle", "p_conservative": 0.4, "settings": {"action_repeat": 1}})
+    )
+    assert "damaged" in refuse(capsys, "policy", "evaluate", "--model", tmp_path / "policy.zip")
+
+
+# Interruption
+
+
+class Started:
+    """A ``tint-sumo`` of its own, interrupted as soon as its stderr matches a pattern."""
+
+    def __init__(self, *argv: Any) -> None:
+        command = [sys.executable, "-m", "tint_sumo.cli", *map(str, argv)]
+        self.process = subprocess.Popen(command, stderr=subprocess.PIPE)
+
+    def interrupt_at(self, pattern: str) -> str:
+        """What it printed after the interruption."""
+        assert self.process.stderr is not None
+        seen, end = "", time.monotonic() + PATIENCE_S
+        while not re.search(pattern, seen):
+            assert time.monotonic() < end, seen
+            piece = self.process.stderr.read1()  # type: ignore[attr-defined]
+            assert piece, seen
+            seen += piece.decode()
+        self.process.send_signal(signal.SIGINT)
+        rest = self.process.stderr.read().decode()
+        assert self.process.wait(PATIENCE_S) == 130
+        return rest
+
+
+def test_an_interrupted_training_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ("policy", "train", "--method", "oracle", "--steps", 5_000, "--out", tmp_path / "run")
+    printed = Started(*argv).interrupt_at(r"[1-9]\d*/5000")
+    assert "Traceback" not in printed
+    assert "tint-sumo: interrupted" in printed
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names == {"run.json", "checkpoint.zip", "tensorboard"}
+    run(capsys, *argv)
+    assert (tmp_path / "run" / "policy.zip").exists()
+    assert not (tmp_path / "run" / "checkpoint.zip").exists()
+
+
+def test_an_interrupted_study_leaves_whole_files(tmp_path: Path) -> None:
+    out = tmp_path / "study"
+    printed = Started("study", "run", "--out", out).interrupt_at(r"record: +[1-9]")
+    assert "Traceback" not in printed
+    assert "the same command goes on from here" in printed
+    assert not list(out.rglob("*.partial"))
+    assert (out / "run.json").exists()
+    assert not (out / "dataset" / "manifest.json").exists()
+    for shard in (out / "dataset" / "trajectories").iterdir():
+        assert shard.read_bytes().endswith(b"PAR1")

@@ -1,0 +1,320 @@
+"""The ``tint-sumo`` command. Each command is a dataclass whose fields are its flags."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
+
+from tint_sumo.errors import InputError
+
+if TYPE_CHECKING:
+    from tint_sumo.study.report import StudyReport
+
+# What a command needs is imported when it runs: --help shall not wait for torch and SUMO.
+# ruff: noqa: PLC0415
+
+BudgetName = Literal["quick", "paper"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command prints: lines for people and, with --json, one object."""
+
+    text: str
+    content: dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    json: bool = False
+    """Print one JSON object as the last line of stdout."""
+
+    def run(self) -> Outcome:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Net(Command):
+    """Build the road network, the drivers and plain SUMO's configuration with netconvert."""
+
+    replicas: int = 1
+    """Number of intersections in the network."""
+    out: Path = Path("sumo_net")
+    """Folder for the files; files of the same names are replaced if this command wrote them."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.scenario.build import CONFIG_FILE, write_scenario
+
+        files = write_scenario(self.out, self.replicas)
+        text = f"wrote {len(files)} files to {self.out}; run them with: sumo -c {self.out / CONFIG_FILE}"
+        return Outcome(text, {"replicas": self.replicas, "files": [str(file) for file in files]})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record(Command):
+    """Record a dataset of traffic without the ego vehicle; the same command resumes an interrupted recording."""
+
+    out: Path
+    """Folder for the dataset."""
+    windows: int = 30_000
+    """At least so many windows of up to 20 steps of 0.1 s."""
+    p_conservative: float = 0.5
+    """Probability that a driver is conservative, 0 to 1."""
+    seed: int = 0
+    """Seed of the traffic."""
+    workers: int = 1
+    """Processes that simulate; the dataset does not depend on their number."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.dataset.recorder import record
+
+        manifest = record(
+            self.out, self.windows, p_conservative=self.p_conservative, seed=self.seed, workers=self.workers
+        )
+        return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainTraits(Command):
+    """Train a trait model on a dataset, without labels; the same command resumes an interrupted training."""
+
+    data: Path
+    """Folder of a dataset."""
+    out: Path
+    """Folder for the model."""
+    method: str = "ours"
+    """Trait method; ours is the paper's."""
+    budget: BudgetName = "quick"
+    """Sizes of the network and of its training."""
+    seed: int = 0
+    """Seed of the training, and of the split into training and test episodes."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.budgets import find_budget
+        from tint_sumo.study.trait_models import train_traits
+
+        card = train_traits(
+            self.data, self.out, method=self.method, settings=find_budget(self.budget).traits, seed=self.seed
+        )
+        return Outcome(
+            f"trained {self.method} on {card['windows']} windows: {self.out}", {**card, "out": str(self.out)}
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateTraits(Command):
+    """Tell how well a linear classifier reads the drivers' traits from a model's latents, on unseen episodes."""
+
+    data: Path
+    """Folder of a dataset; the test episodes are those that training with the model's seed leaves out."""
+    model: str
+    """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
+    figure: Path | None = None
+    """Where a PNG of the latent space goes."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.trait_models import evaluate_traits
+
+        found = evaluate_traits(self.data, self.model, self.figure)
+        text = f"accuracy {found['accuracy']:.2%} on {found['windows']} windows"
+        return Outcome(text if self.figure is None else f"{text}\nwrote {self.figure}", found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainPolicy(Command):
+    """Train a navigation policy with PPO; the same command resumes an interrupted training."""
+
+    method: str
+    """Learned method: no_labels, ours or oracle."""
+    out: Path
+    """Folder for the policy, its card and the TensorBoard log."""
+    p_conservative: float = 0.4
+    """Probability that a driver is conservative, 0 to 1."""
+    steps: int | None = None
+    """Decisions of the policy; those of the budget if not given."""
+    seed: int = 0
+    """Seed of the training, 0 to 1000."""
+    budget: BudgetName = "quick"
+    """Sizes of the network and settings of PPO."""
+    traits: str = "ours"
+    """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.budgets import find_budget
+        from tint_sumo.study.progress import progress_bar
+        from tint_sumo.study.training import train_policy
+
+        _use_one_thread()
+        settings = find_budget(self.budget).ppo
+        steps = settings.total_steps if self.steps is None else self.steps
+        with progress_bar(f"policy {self.method}", "step") as report:
+            policy = train_policy(
+                self.method,
+                self.p_conservative,
+                steps,
+                self.seed,
+                self.out,
+                settings=settings,
+                traits=self.traits,
+                report=report,
+            )
+        content = {"model": str(policy), "method": self.method, "p_conservative": self.p_conservative}
+        return Outcome(f"trained {self.method}: {policy}", {**content, "steps": steps, "seed": self.seed})
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluatePolicy(Command):
+    """Evaluate a policy on unseen cases, which are the same for every policy; rates are fractions of episodes."""
+
+    model: str
+    """shipped, always_go, ttc, the folder of a training run, or a policy's .zip file (only from sources you trust)."""
+    p_conservative: float | None = None
+    """Probability that a driver is conservative, 0 to 1; the one of the policy's training if not given."""
+    episodes: int = 500
+    """Number of cases."""
+    seed: int = 0
+    """Which set of cases, 0 to 1000."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.evaluation import OUTCOMES, evaluate
+        from tint_sumo.study.loading import load_policy
+        from tint_sumo.study.progress import progress_bar
+
+        _use_one_thread()
+        contender = load_policy(self.model)
+        p_conservative = contender.p_conservative if self.p_conservative is None else self.p_conservative
+        with progress_bar(self.model, "case") as report:
+            evaluation = evaluate(
+                contender.policy,
+                lambda num_envs: contender.make_venv(num_envs, p_conservative),
+                self.episodes,
+                self.seed,
+                report=report,
+            )
+        rates = {outcome: evaluation.rate(outcome) for outcome in OUTCOMES}
+        lines = [
+            f"{outcome:9} {rate.value:6.1%}  (95 % interval {rate.interval[0]:.1%} to {rate.interval[1]:.1%})"
+            for outcome, rate in rates.items()
+        ]
+        time_s = evaluation.navigation_time_s
+        lines.append("no success" if time_s is None else f"navigation time {time_s:.1f} s")
+        content = {"model": self.model, "p_conservative": p_conservative, "seed": self.seed, **evaluation.summary()}
+        return Outcome("\n".join(lines), content)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunStudy(Command):
+    """Record, learn traits, train and evaluate every method, report; the same command resumes an interrupted study."""
+
+    budget: BudgetName = "quick"
+    """quick: minutes, a small network and few steps. paper: all numbers as in the paper, days."""
+    out: Path | None = None
+    """Folder of the study; runs/<budget> if not given."""
+    workers: int = 2
+    """Processes at a time."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.budgets import find_budget
+        from tint_sumo.study.grid import run_study
+
+        out = Path("runs") / self.budget if self.out is None else self.out
+        return _report_outcome(run_study(find_budget(self.budget), out, workers=self.workers))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportStudy(Command):
+    """Make a study's results table and figure again."""
+
+    out: Path = Path("runs/quick")
+    """Folder of the study."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.report import write_report
+
+        return _report_outcome(write_report(self.out))
+
+
+@dataclass(frozen=True)
+class Traits:
+    """Driver traits learnt from trajectories."""
+
+    command: Annotated[TrainTraits, subcommand("train")] | Annotated[EvaluateTraits, subcommand("evaluate")]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Navigation policies."""
+
+    command: Annotated[TrainPolicy, subcommand("train")] | Annotated[EvaluatePolicy, subcommand("evaluate")]
+
+
+@dataclass(frozen=True)
+class Study:
+    """The study end to end."""
+
+    command: Annotated[RunStudy, subcommand("run")] | Annotated[ReportStudy, subcommand("report")]
+
+
+@dataclass(frozen=True)
+class TintSumo:
+    """Driving among strangers: driver-trait inference and intersection navigation on Eclipse SUMO."""
+
+    command: (
+        Annotated[Net, subcommand("net")]
+        | Annotated[Record, subcommand("record")]
+        | Annotated[Traits, subcommand("traits")]
+        | Annotated[Policy, subcommand("policy")]
+        | Annotated[Study, subcommand("study")]
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code is 0, 2 after bad input, or 130 after an interruption."""
+    parsed: Any = tyro.cli(
+        TintSumo,
+        prog="tint-sumo",
+        args=argv,
+        config=(OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff),
+    )
+    while not isinstance(parsed, Command):
+        parsed = parsed.command
+    try:
+        outcome = parsed.run()
+    except InputError as error:
+        print(f"tint-sumo: error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print(f"tint-sumo: error: {error.filename}: {error.strerror}; check the path", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\ntint-sumo: interrupted; all files are whole, the same command goes on from here", file=sys.stderr)
+        return 130
+    print(outcome.text)
+    if parsed.json:
+        print(json.dumps(outcome.content))
+    return 0
+
+
+def _use_one_thread() -> None:
+    """Policies are small: more threads gain little, and cost a multiple as soon as other work needs the cores."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _report_outcome(report: "StudyReport") -> Outcome:
+    files = {"csv": report.csv_file, "markdown": report.markdown_file, "figure": report.figure_file}
+    text = "\n".join([report.markdown, *(f"wrote {file}" for file in files.values())])
+    content = {"results": [row.to_json() for row in report.rows]}
+    return Outcome(text, {**content, **{name: str(file) for name, file in files.items()}})
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,71 @@
+"""What a study runs: everything that sets its cost and its quality, in one place."""
+
+from dataclasses import dataclass, field
+
+from tint_sumo.config import P_CONSERVATIVE, PolicySettings, PpoSettings, VaeSettings
+from tint_sumo.errors import InputError
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Sizes of all stages of a study."""
+
+    windows: int  # to record
+    record_p_conservative: float = 0.5  # share of conservative drivers in the dataset
+    traits: VaeSettings = field(default_factory=VaeSettings)
+    ppo: PpoSettings = field(default_factory=PpoSettings)  # with the steps of every policy
+    methods: tuple[str, ...] = ("always_go", "ttc", "no_labels", "ours", "oracle")
+    p_conservative: tuple[float, ...] = P_CONSERVATIVE
+    seeds: tuple[int, ...] = (0, 1, 2)
+    episodes: int = 500  # per policy (paper IV-C)
+
+
+BUDGETS = {
+    "quick": Budget(
+        windows=30_000,
+        traits=VaeSettings(
+            embedding_sizes=(16, 32),
+            hidden_size=32,
+            encoder_output_size=32,
+            decoder_output_size=32,
+            learning_rate=5e-3,
+            batch_size=256,
+            epochs=20,
+        ),
+        ppo=PpoSettings(
+            n_envs=64,
+            n_steps=64,
+            n_epochs=4,
+            n_minibatches=4,
+            learning_rate=1e-3,
+            gamma=0.993,  # of a decision of 0.4 s; with less, waiting for a gap does not pay
+            ent_coef=0.005,
+            total_steps=150_000,
+            action_repeat=4,
+            policy=PolicySettings(
+                position_gain=6.0,
+                embedding_sizes=(64, 64),
+                score_sizes=(64,),
+                context_size=64,
+                joint_sizes=(64, 64),
+                hidden_size=64,
+                head_sizes=(64,),
+            ),
+        ),
+        p_conservative=(0.4,),
+        seeds=(0,),
+        episodes=200,
+    ),
+    "paper": Budget(windows=696_000),  # the number of the paper's trajectories
+}
+
+
+def find_budget(name: str) -> Budget:
+    """The budget called ``name``.
+
+    Raises:
+        InputError: there is none.
+    """
+    if name not in BUDGETS:
+        raise InputError(f"unknown budget {name!r}; choose one of: {', '.join(BUDGETS)}")
+    return BUDGETS[name]

@@ -1,0 +1,177 @@
+"""Jobs in worker processes that end cleanly: with Ctrl-C, with an error, or with the main process."""
+
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import connection, get_context, parent_process
+from multiprocessing.connection import Connection
+from types import FrameType
+from typing import Any, NoReturn, Protocol
+
+from tqdm import tqdm
+
+from tint_sumo.errors import InputError
+from tint_sumo.study.progress import Report
+
+REFRESH_S = 1.0
+THREADS_PER_JOB = 1  # of torch: the jobs share the cores among them
+INTERRUPT_S = 30.0  # more than enough to save a checkpoint
+_CONTEXT = get_context("spawn")  # a forked child would share a running libsumo
+
+
+class Job(Protocol):
+    """A piece of work; must survive pickling, and go on where it was interrupted. It has a process to itself."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the jobs that must be done before."""
+
+    def is_done(self) -> bool: ...
+
+    def run(self, report: Report) -> str:
+        """Do the work and say in a line what came out."""
+
+
+def run_jobs(jobs: Sequence[Job], workers: int, progress: bool = True) -> None:
+    """Run the jobs that are not done, up to ``workers`` at a time, in the given order as far as their needs allow.
+
+    Raises:
+        InputError, RuntimeError: a job failed; the others were interrupted.
+    """
+    waiting = [job for job in jobs if not job.is_done()]
+    running: list[_Worker] = []
+    free = list(range(1, workers + 1))  # lines of the terminal below the global bar
+    with _global_bar(len(jobs), len(waiting), progress) as bar:
+        try:
+            while waiting or running:
+                open_names = {job.name for job in waiting} | {worker.job.name for worker in running}
+                ready = [job for job in waiting if not open_names.intersection(job.needs)]
+                for job, line in zip(ready, tuple(free), strict=False):
+                    waiting.remove(job)
+                    free.remove(line)
+                    running.append(_Worker(job, line, progress))
+                for worker in _heard_from(running):
+                    outcome = worker.listen()
+                    if outcome is not None:
+                        running.remove(worker)
+                        free.append(worker.line)
+                        free.sort()
+                        if progress:
+                            tqdm.write(f"{worker.job.name}: {outcome}", file=sys.stderr)
+                        bar.update()
+                if sys.stderr.isatty():
+                    bar.refresh()
+        finally:
+            for worker in running:
+                worker.interrupt()
+            for worker in running:
+                worker.join()
+
+
+def _global_bar(jobs: int, waiting: int, progress: bool) -> "tqdm[NoReturn]":
+    return tqdm(desc="study", total=jobs, initial=jobs - waiting, unit="job", disable=not progress)
+
+
+def _heard_from(running: "Sequence[_Worker]") -> "list[_Worker]":
+    """Workers with news; waits a moment for some, and keeps the bars' clocks going."""
+    heard = connection.wait([worker.pipe for worker in running], REFRESH_S)
+    for worker in running:
+        worker.bar.refresh()
+    return [worker for worker in running if worker.pipe in heard]
+
+
+class _Worker:
+    """A process that does one job, and its progress bar."""
+
+    def __init__(self, job: Job, line: int, progress: bool) -> None:
+        self.job = job
+        self.line = line
+        # Where bars cannot be redrawn in place, as in a log file, the global one is enough.
+        hidden = not (progress and sys.stderr.isatty())
+        self.bar: tqdm[NoReturn] = tqdm(desc=job.name, total=1, position=line, leave=False, disable=hidden)
+        self.pipe, theirs = _CONTEXT.Pipe(duplex=False)
+        self._process = _CONTEXT.Process(target=_work, args=(job, theirs), daemon=True)
+        with _interrupts_blocked():
+            self._process.start()
+        theirs.close()
+
+    def listen(self) -> str | None:
+        """Take one message; the job's closing line if it was the last.
+
+        Raises:
+            InputError, RuntimeError: the job failed.
+        """
+        try:
+            kind, content = self.pipe.recv()
+        except EOFError:
+            kind, content = "died", None
+        if kind == "progress":
+            self.bar.n, self.bar.total, note = content
+            self.bar.set_postfix_str(note, refresh=False)
+            return None
+        self.bar.close()
+        self._process.join()
+        if kind == "refused":
+            raise InputError(f"{self.job.name}: {content}")
+        if kind == "died":
+            raise RuntimeError(f"{self.job.name} ended with exit code {self._process.exitcode}")
+        return str(content)
+
+    def interrupt(self) -> None:
+        """Tell the process to save its work and end."""
+        self.bar.close()
+        self._process.terminate()
+
+    def join(self) -> None:
+        """Wait for the process to end."""
+        self._process.join(INTERRUPT_S)
+        self._process.kill()
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Processes started in this block never see Ctrl-C; the main process tells them to end."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _work(job: Job, pipe: Connection) -> None:
+    """The worker process."""
+    signal.signal(signal.SIGTERM, _raise_interrupt)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+    def report(*content: Any) -> None:
+        pipe.send(("progress", content))
+
+    try:
+        message = ("finished", job.run(report))
+    except InputError as error:
+        message = ("refused", str(error))
+    except KeyboardInterrupt:
+        return
+    except Exception:
+        traceback.print_exc()
+        sys.exit(1)
+    pipe.send(message)
+
+
+def _raise_interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def _end_with_parent() -> None:
+    """A killed main process cannot tell anyone, and two runs must never write the same files."""
+    parent = parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os._exit(1)

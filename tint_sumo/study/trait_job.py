@@ -1,0 +1,50 @@
+"""The study's job of learning one trait representation."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from tint_sumo.config import VaeSettings
+from tint_sumo.files import write_json
+from tint_sumo.study.pool import THREADS_PER_JOB
+from tint_sumo.study.progress import Report
+from tint_sumo.study.trait_models import evaluate_traits, train_traits
+from tint_sumo.traits.storage import add_to_card
+
+DATASET = "dataset"  # folder of the dataset in a study's folder
+SEED = 0  # of the dataset and of the trait models
+
+
+@dataclass(frozen=True)
+class TraitJob:
+    """Train a trait model on the study's dataset and see how well it tells the traits apart."""
+
+    method: str
+    settings: VaeSettings
+    out: Path  # of the study
+
+    @property
+    def name(self) -> str:
+        return f"traits {self.method}"
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return ()
+
+    @property
+    def folder(self) -> Path:
+        return self.out / "traits" / self.method
+
+    def is_done(self) -> bool:
+        return (self.folder / "evaluation.json").exists()
+
+    def run(self, report: Report) -> str:
+        torch.set_num_threads(THREADS_PER_JOB)
+        report(0, 1, "training")
+        data = self.out / DATASET
+        train_traits(data, self.folder, method=self.method, settings=self.settings, seed=SEED, progress=False)
+        found = evaluate_traits(data, self.folder, figure=self.folder / "latent.png")
+        add_to_card(self.folder / "model.safetensors", {"accuracy": found["accuracy"]})
+        write_json(self.folder / "evaluation.json", found)
+        return f"{found['accuracy']:.1%} of {found['windows']} unseen windows told apart"

@@ -131,19 +131,38 @@ def test_recording_again_leaves_a_finished_dataset_alone(dataset: Path) -> None:
     assert {file: file.stat().st_mtime_ns for file in dataset.rglob("*")} == before
 
 
+def wait_for_workers(mark: str) -> None:
+    """Workers must end with the process that started them."""
+    deadline = time.monotonic() + 20
+    while any(mark in _environment(process) for process in Path("/proc").glob("[0-9]*")):
+        assert time.monotonic() < deadline, "a worker outlives the main process"
+        time.sleep(0.05)
+
+
+def _environment(process: Path) -> str:
+    try:
+        return (process / "environ").read_bytes().decode(errors="replace")
+    except OSError:  # it has just ended
+        return ""
+
+
+@pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
-def test_a_killed_recording_resumes_to_the_very_dataset(tmp_path: Path, sent: signal.Signals) -> None:
+def test_a_killed_recording_resumes_to_the_very_dataset(tmp_path: Path, sent: signal.Signals, workers: int) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     record(whole, TWO_SHARDS, progress=False)
-    call = f"record(Path(r'{killed}'), {TWO_SHARDS})"
-    code = f"from pathlib import Path; from tint_sumo.dataset.recorder import record; {call}"
-    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+    call = f"if __name__ == '__main__':\n    record(Path(r'{killed}'), {TWO_SHARDS}, workers={workers})\n"
+    script = tmp_path / "script.py"
+    script.write_text(f"from pathlib import Path\nfrom tint_sumo.dataset.recorder import record\n{call}")
+    marked = {**os.environ, "RECORDING": str(script)}  # inherited by the workers
+    process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.DEVNULL, env=marked)
     deadline = time.monotonic() + 60
     while not list(killed.glob(f"{TRAJECTORIES}/shard-*.parquet")):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.01)
     os.kill(process.pid, sent)
     process.wait()
+    wait_for_workers(str(script))
     assert not (killed / MANIFEST).exists()
     for file in killed.glob("*/shard-*.parquet"):
         pd.read_parquet(file)  # whole

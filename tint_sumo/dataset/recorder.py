@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,7 @@ from tint_sumo.dataset.schema import (
 )
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, read_json, whole_file, write_json
+from tint_sumo.processes import SPAWN, end_with_parent
 from tint_sumo.scenario.geometry import LANE_DIRECTION, LANE_NAMES
 from tint_sumo.simulation.intersections import Intersections
 
@@ -119,8 +119,7 @@ def _shards(recording: Recording, out: Path, workers: int) -> Iterator[Iterator[
     if workers == 1:
         yield (_record_shard(recording, out, shard) for shard in _naturals())
         return
-    context = get_context("spawn")  # a forked child would share a running libsumo
-    with ProcessPoolExecutor(workers, context, initializer=_ignore_interrupts) as pool:
+    with ProcessPoolExecutor(workers, SPAWN, initializer=_start_worker) as pool:
         try:
             yield _ahead(pool, recording, out, workers)
         finally:
@@ -142,9 +141,10 @@ def _naturals() -> Iterator[int]:
         number += 1
 
 
-def _ignore_interrupts() -> None:
-    """Leave Ctrl-C to the main process."""
+def _start_worker() -> None:
+    """Leave Ctrl-C to the main process, and go with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
 
 
 def _remove_shards_from(out: Path, first: int) -> None:

@@ -1,13 +1,11 @@
 """Jobs in worker processes that end cleanly: with Ctrl-C, with an error, or with the main process."""
 
-import os
 import signal
 import sys
-import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from multiprocessing import connection, get_context, parent_process
+from multiprocessing import connection
 from multiprocessing.connection import Connection
 from types import FrameType
 from typing import Any, NoReturn, Protocol
@@ -15,12 +13,12 @@ from typing import Any, NoReturn, Protocol
 from tqdm import tqdm
 
 from tint_sumo.errors import InputError
+from tint_sumo.processes import SPAWN, end_with_parent
 from tint_sumo.study.progress import Report
 
 REFRESH_S = 1.0
 THREADS_PER_JOB = 1  # of torch: the jobs share the cores among them
 INTERRUPT_S = 30.0  # more than enough to save a checkpoint
-_CONTEXT = get_context("spawn")  # a forked child would share a running libsumo
 
 
 class Job(Protocol):
@@ -96,8 +94,8 @@ class _Worker:
         # Where bars cannot be redrawn in place, as in a log file, the global one is enough.
         hidden = not (progress and sys.stderr.isatty())
         self.bar: tqdm[NoReturn] = tqdm(desc=job.name, total=1, position=line, leave=False, disable=hidden)
-        self.pipe, theirs = _CONTEXT.Pipe(duplex=False)
-        self._process = _CONTEXT.Process(target=_work, args=(job, theirs), daemon=True)
+        self.pipe, theirs = SPAWN.Pipe(duplex=False)
+        self._process = SPAWN.Process(target=_work, args=(job, theirs), daemon=True)
         with _interrupts_blocked():
             self._process.start()
         theirs.close()
@@ -148,7 +146,7 @@ def _interrupts_blocked() -> Iterator[None]:
 def _work(job: Job, pipe: Connection) -> None:
     """The worker process."""
     signal.signal(signal.SIGTERM, _raise_interrupt)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
 
     def report(*content: Any) -> None:
         pipe.send(("progress", content))
@@ -167,11 +165,3 @@ def _work(job: Job, pipe: Connection) -> None:
 
 def _raise_interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
     raise KeyboardInterrupt
-
-
-def _end_with_parent() -> None:
-    """A killed main process cannot tell anyone, and two runs must never write the same files."""
-    parent = parent_process()
-    assert parent is not None
-    connection.wait([parent.sentinel])
-    os._exit(1)

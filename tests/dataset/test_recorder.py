@@ -186,6 +186,12 @@ def test_bad_arguments_write_nothing(tmp_path: Path, arguments: dict[str, float]
     assert not (tmp_path / "d").exists()
 
 
+def test_libsumo_is_free_again_after_recording(tmp_path: Path) -> None:
+    record(tmp_path / "d", 10, progress=False)
+    simulation = Intersections(1, backend="libsumo")
+    simulation.close()
+
+
 def test_a_folder_of_another_run_is_left_alone(dataset: Path, tmp_path: Path) -> None:
     before = contents(dataset)
     with pytest.raises(InputError, match=r"already holds another run \(different: seed\)"):

@@ -117,7 +117,10 @@ def record(
 def _shards(recording: Recording, out: Path, workers: int) -> Iterator[Iterator[int]]:
     """Window counts of shards 0, 1, ..., recorded here or, ahead of their use, in worker processes."""
     if workers == 1:
-        yield (_record_shard(recording, out, shard) for shard in _naturals())
+        try:
+            yield (_record_shard(recording, out, shard) for shard in _naturals())
+        finally:
+            _simulation.cache_clear()  # ends the simulation: libsumo is free again
         return
     with ProcessPoolExecutor(workers, SPAWN, initializer=_start_worker) as pool:
         try:

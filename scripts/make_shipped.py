@@ -7,6 +7,7 @@ Takes about half an hour on two cores. The commands it runs are those of data/RE
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -16,9 +17,14 @@ from PIL import Image
 
 from tint_sumo import ENV_ID
 from tint_sumo.cli import main as tint_sumo
+from tint_sumo.study.budgets import BUDGETS
+from tint_sumo.study.progress import progress_bar
+from tint_sumo.study.training import train_policy
 
 DATA = Path(__file__).resolve().parents[1] / "data"
+QUICK = BUDGETS["quick"].ppo
 POLICY_STEPS = 1_200_000
+POLICY_SETTINGS = replace(QUICK, n_epochs=4, n_minibatches=4, learning_rate=1e-3, ent_coef=0.005, time_limit_s=50.0)
 
 
 def run(*arguments: str) -> None:
@@ -31,8 +37,8 @@ def make_models(work: Path) -> None:
     dataset, traits, policy = (str(work / name) for name in ("dataset", "ours", "ours04"))
     run("record", "--out", dataset, "--windows", "60000")
     run("traits", "train", "--data", dataset, "--out", traits)
-    steps = ("--steps", str(POLICY_STEPS), "--p-conservative", "0.4", "--seed", "0")
-    run("policy", "train", "--method", "ours", "--traits", traits, *steps, "--out", policy)
+    with progress_bar("policy ours", "step") as report:
+        train_policy("ours", 0.4, POLICY_STEPS, 0, Path(policy), settings=POLICY_SETTINGS, traits=traits, report=report)
     copies = {
         f"{traits}/model.safetensors": "ours.safetensors",
         f"{traits}/model.json": "ours.json",

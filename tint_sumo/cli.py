@@ -223,7 +223,10 @@ class RunStudy(Command):
         from tint_sumo.study.grid import run_study
 
         out = Path("runs") / self.budget if self.out is None else self.out
-        return _report_outcome(run_study(find_budget(self.budget), out, workers=self.workers))
+        outcome = _report_outcome(run_study(find_budget(self.budget), out, workers=self.workers))
+        made = [out / "dataset", *sorted(out.glob("traits/*/latent.png")), *sorted(out.glob("policies/*/policy.zip"))]
+        lines = "\n".join(f"wrote {path}" for path in made)
+        return Outcome(f"{outcome.text}\n{lines}", {**outcome.content, "made": [str(path) for path in made]})
 
 
 @dataclass(frozen=True, kw_only=True)

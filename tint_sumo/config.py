@@ -209,3 +209,4 @@ class PpoSettings:
     total_steps: int = 10_000_000  # paper
     policy: PolicySettings = field(default_factory=PolicySettings)
     action_repeat: int = 1  # paper: a decision every step
+    time_limit_s: float = 50.0  # of training episodes; evaluation always has the paper's 50 s

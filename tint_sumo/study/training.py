@@ -88,7 +88,7 @@ def train_policy(
 
     if encoder is not None:
         save(encoder, out / TRAITS, read_card(traits))
-    venv = TIntersectionVecEnv(settings.n_envs, p_conservative=p_conservative)
+    venv = TIntersectionVecEnv(settings.n_envs, p_conservative=p_conservative, time_limit_s=settings.time_limit_s)
     try:
         observed = VecMonitor(TraitObservation(venv, learned.source(encoder)))
         _learn(ActionRepeat(observed, settings.action_repeat), steps, seed, out, settings, report)

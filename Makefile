@@ -13,7 +13,7 @@ install: $(VENV)/.installed
 $(VENV)/.installed: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 ifeq ($(TORCH),)
-	$(BIN)/python -m pip install --quiet "torch==2.13.0+cpu" || $(BIN)/python -m pip install "torch==2.13.0"
+	$(BIN)/python -m pip install --quiet "torch==2.13.0+cpu" 2>/dev/null || $(BIN)/python -m pip install "torch==2.13.0"
 else
 	$(BIN)/python -m pip install "$(TORCH)"
 endif

@@ -1,5 +1,6 @@
 """Episodes of the navigation task in a batch of intersections: what all environment classes share."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -125,25 +126,25 @@ class Episodes:
         self.simulation.reset(index, seed)
         self.steps[index] = 0
         self._noise[index] = np.random.default_rng([seed, 1])
-        self._measure(index)
+        self._measure([index])
 
     def step(self, actions: NDArray[np.integer]) -> Transition:
         simulation = self.simulation
         simulation.step(self._speeds_mps[actions])
         self.steps += 1
-        for index in range(len(self.steps)):
-            self._measure(index)
+        self._measure(range(len(self.steps)))
         collision = np.array([event is not None for event in simulation.collision])
         success = has_reached_goal(simulation.ego_pose(), simulation.scenario) & ~collision
         timeout = (self.steps >= self._step_limit) & ~(success | collision)
         terms = reward_terms(simulation.ego_speed_mps, success, collision, self._preset)
         return Transition(np.sum(list(terms.values()), axis=0), terms, success, collision, timeout)
 
-    def _measure(self, index: int) -> None:
-        """Draw the noise of this step's position measurements."""
+    def _measure(self, indices: Iterable[int]) -> None:
+        """Draw the noise of this step's position measurements, from each environment's own generator."""
         sigma_m = self.settings.position_noise_m
         if sigma_m > 0.0:
-            self._measured_noise_m[index] = self._noise[index].normal(0.0, sigma_m, (MAX_VEHICLES, 2))
+            for index in indices:
+                self._measured_noise_m[index] = self._noise[index].normal(0.0, sigma_m, (MAX_VEHICLES, 2))
 
     def observe(self) -> Observation:
         """Observations of all environments, batched along the first axis."""

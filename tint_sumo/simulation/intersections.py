@@ -90,17 +90,18 @@ class Intersections:
 
     Read-only state, all arrays of this batch (do not write to them):
 
-    ================= ======== ===============================================================
-    ``present``       (R, 12)  which slots hold a vehicle
-    ``lane``          (R, 12)  0 lower (west), 1 upper (east)
-    ``front_m``       (R, 12)  front bumper's distance along the lane
-    ``member``        (R, 12)  index into :attr:`population`, -1 in empty slots
-    ``vehicle_number`` (R, 12) running number of the vehicle in its replica's episode
-    ``x_m``, ``y_m``  (R, 12)  vehicle centres
-    ``ego_front_m``   (R,)     front bumper's distance along the ego's path
-    ``ego_speed_mps`` (R,)
-    ``time_s``        (R,)     since the episode's start
-    ================= ======== ===============================================================
+    ================== ======== ==================================================================
+    ``present``        (R, 12)  which slots hold a vehicle
+    ``lane``           (R, 12)  0 lower (west), 1 upper (east)
+    ``front_m``        (R, 12)  front bumper's distance along the lane
+    ``member``         (R, 12)  index into :attr:`population`, -1 in empty slots
+    ``vehicle_number`` (R, 12)  running number of the vehicle in its replica's episode, -1 in empty slots
+    ``x_m``, ``y_m``   (R, 12)  vehicle centres
+    ``ego_front_m``    (R,)     front bumper's distance along the ego's path
+    ``ego_speed_mps``  (R,)
+    ``time_s``         (R,)     since the episode's start
+    ``collision``      R items  the ego's first collision in the episode, or None
+    ================== ======== ==================================================================
 
     A vehicle keeps its slot while it is on the street, and a slot stays empty for at least one step between two
     vehicles. At most 12 vehicles are on a street; further ones wait outside.

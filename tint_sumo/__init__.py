@@ -38,7 +38,6 @@ class _RegisterAfterGymnasium(MetaPathFinder):
     ) -> ModuleSpec | None:
         if fullname != "gymnasium":
             return None
-        sys.meta_path.remove(self)
         spec = PathFinder.find_spec(fullname, path, target)
         if spec is None or spec.loader is None:
             return None
@@ -46,6 +45,8 @@ class _RegisterAfterGymnasium(MetaPathFinder):
 
         def run_and_register(module: ModuleType) -> None:
             run_gymnasium(module)
+            if self in sys.meta_path:
+                sys.meta_path.remove(self)
             register_envs()
 
         spec.loader.exec_module = run_and_register  # type: ignore[method-assign]

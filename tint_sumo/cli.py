@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 BudgetName = Literal["quick", "paper"]
 
+RESUMES = ", the same command goes on from here"
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -31,6 +33,8 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
+    after_interrupt: ClassVar[str] = ", nothing was kept"
+
     json: bool = False
     """Print one JSON object as the last line of stdout."""
 
@@ -59,6 +63,8 @@ class Net(Command):
 class Record(Command):
     """Record a dataset of traffic without the ego vehicle; the same command resumes an interrupted recording."""
 
+    after_interrupt: ClassVar[str] = RESUMES
+
     out: Path
     """Folder for the dataset."""
     windows: int = 30_000
@@ -82,6 +88,8 @@ class Record(Command):
 @dataclass(frozen=True, kw_only=True)
 class TrainTraits(Command):
     """Train a trait model on a dataset, without labels; the same command resumes an interrupted training."""
+
+    after_interrupt: ClassVar[str] = RESUMES
 
     data: Path
     """Folder of a dataset."""
@@ -128,6 +136,8 @@ class EvaluateTraits(Command):
 @dataclass(frozen=True, kw_only=True)
 class TrainPolicy(Command):
     """Train a navigation policy with PPO; the same command resumes an interrupted training."""
+
+    after_interrupt: ClassVar[str] = RESUMES
 
     method: str
     """Learned method: no_labels, ours or oracle."""
@@ -210,6 +220,8 @@ class EvaluatePolicy(Command):
 @dataclass(frozen=True, kw_only=True)
 class RunStudy(Command):
     """Record, learn traits, train and evaluate every method, report; the same command resumes an interrupted study."""
+
+    after_interrupt: ClassVar[str] = RESUMES
 
     budget: BudgetName = "quick"
     """quick: minutes, a small network and few steps. paper: all numbers as in the paper, days."""
@@ -297,7 +309,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"tint-sumo: error: {error.filename}: {error.strerror}; check the path", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("\ntint-sumo: interrupted; all files are whole, the same command goes on from here", file=sys.stderr)
+        print("\ntint-sumo: interrupted; all files are whole" + parsed.after_interrupt, file=sys.stderr)
         return 130
     print(outcome.text)
     if parsed.json:

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
-from tint_sumo.dataset.recorder import simulate_episodes
+from tint_sumo.dataset.recorder import _leaders, record, simulate_episodes
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, NO_LEADER_GAP_M, TRAJECTORIES, TRAJECTORY_SCHEMA
 from tint_sumo.dataset.windows import Windows, cut_windows, load_labels, load_windows, split_by_episode
 from tint_sumo.errors import InputError
@@ -87,22 +87,29 @@ def test_trajectories_have_no_column_of_the_driver() -> None:
 
 
 def test_drivers_that_move_alike_look_alike_whatever_their_trait() -> None:
-    """Behind a standing vehicle nobody moves, and nobody ahead is seen: the inputs of both traits are equal."""
-    rows = []
+    """Two vehicles held to one speed give the same inputs, gaps and their stand-in included, for either trait."""
+    found = []
     for profile in (CONSERVATIVE, AGGRESSIVE):
         simulation = Intersections(1, with_ego=False)
         member = next(i for i, one in enumerate(simulation.population) if one.profile is profile)
-        simulation.reset_to(0, [PlacedVehicle(1, 10.0, member)])
-        simulation._connection.vehicle.setSpeed(simulation._ids[0][0], 1.5)  # as if behind somebody slow
-        for _ in range(30):
-            simulation.step()
-        position_m = []
+        simulation.reset_to(0, [PlacedVehicle(1, 20.0, member), PlacedVehicle(1, 10.0, member)])
+        for vehicle_id in simulation._ids[0][:2]:
+            simulation._connection.vehicle.setSpeedMode(vehicle_id, 32)
+            simulation._connection.vehicle.setSpeed(vehicle_id, 1.5)
+        front_m, number, lane = [], [], []
         for _ in range(20):
-            position_m.append(simulation.front_m[0, 0])
             simulation.step()
-        rows.append(cut_windows(np.zeros(20, int), np.zeros(20, int), np.array(position_m), np.full(20, NAN)))
+            front_m.append(simulation.front_m.copy())
+            number.append(simulation.vehicle_number.copy())
+            lane.append(simulation.lane.copy())
         simulation.close()
-    np.testing.assert_allclose(rows[0].states, rows[1].states, atol=1e-5)
+        _, gap_m = _leaders(np.array(front_m), np.array(number), np.array(lane), length_m=5.0)
+        assert np.isnan(gap_m[:, 0, 0]).all()  # the one ahead
+        np.testing.assert_allclose(gap_m[:, 0, 1], 5.0, atol=1e-9)  # the one behind
+        driver = np.repeat([0, 1], 20)
+        tracks = [np.array(values)[:, 0, :2].T.ravel() for values in (front_m, gap_m)]
+        found.append(cut_windows(driver, np.zeros(40, int), *tracks).states)
+    np.testing.assert_array_equal(found[0], found[1])
 
 
 def test_numbers_and_order_do_not_tell_the_trait(dataset: Path) -> None:
@@ -140,6 +147,29 @@ def test_a_damaged_shard(dataset: Path, tmp_path: Path, keep: int) -> None:
     file = next((tmp_path / "d" / TRAJECTORIES).iterdir())
     file.write_bytes(file.read_bytes()[:keep])
     with pytest.raises(InputError, match=r"trajectories is damaged .*; record the dataset anew"):
+        load_windows(tmp_path / "d")
+
+
+def test_a_missing_shard_is_noticed_and_recorded_again(dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(dataset, tmp_path / "d")
+    file = next((tmp_path / "d" / TRAJECTORIES).iterdir())
+    content = file.read_bytes()
+    (tmp_path / "d" / TRAJECTORIES / "shard-00001.parquet").write_bytes(content)
+    with pytest.raises(InputError, match=r"trajectories has \d+ of \d+ rows"):
+        load_windows(tmp_path / "d")
+    (tmp_path / "d" / TRAJECTORIES / "shard-00001.parquet").unlink()
+    file.unlink()
+    record(tmp_path / "d", 3000, seed=1, progress=False)
+    assert file.read_bytes() == content
+
+
+@pytest.mark.parametrize("key", ["rows", "seed"])
+def test_a_manifest_that_lacks_something(dataset: Path, tmp_path: Path, key: str) -> None:
+    shutil.copytree(dataset, tmp_path / "d")
+    manifest = json.loads((tmp_path / "d" / MANIFEST).read_text())
+    del manifest[key]
+    (tmp_path / "d" / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=f"damaged \\(no {key}\\)"):
         load_windows(tmp_path / "d")
 
 

@@ -68,6 +68,13 @@ print(vector.reset(seed=0)[0]["vehicles"].shape)
     assert shape == "(64, 12, 2)"
 
 
+def test_looking_for_gymnasium_before_importing_it_does_no_harm() -> None:
+    look = "import importlib.util; importlib.util.find_spec('gymnasium')"
+    code = f"{look}; import gymnasium; print(gymnasium.spec('{ENV_ID}').id)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == ENV_ID
+
+
 def test_gymnasiums_checker(env: TIntersectionEnv) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -273,14 +280,25 @@ def test_rendering_shows_every_vehicle() -> None:
     [
         ({"p_conservative": 1.5}, r"must lie in \[0, 1\], not 1.5"),
         ({"reward": "mine"}, "unknown reward preset 'mine'; choose one of paper, authors"),
-        ({"time_limit_s": 0.0}, "time_limit_s must be positive"),
-        ({"position_noise_m": -0.1}, "must not be negative"),
+        ({"time_limit_s": 0.01}, "time_limit_s must be at least a step"),
+        ({"time_limit_s": float("inf")}, "time_limit_s must be at least a step of 0.1 s, and finite"),
+        ({"position_noise_m": -0.1}, "must be finite and not negative"),
+        ({"position_noise_m": float("nan")}, "must be finite and not negative"),
         ({"render_mode": "human"}, "unknown render_mode 'human'"),
     ],
 )
 def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         TIntersectionEnv(**arguments)
+
+
+@pytest.mark.parametrize("actions", [[-1, 0], [0, 3], [0]])
+def test_actions_out_of_range_are_refused(actions: list[int]) -> None:
+    vector = TIntersectionVectorEnv(2)
+    vector.reset(seed=0)
+    with pytest.raises(InputError, match="actions must be 2 of 0, 1, 2"):
+        vector.step(np.array(actions))
+    vector.close()
 
 
 def test_seeds_must_fit_the_environments() -> None:

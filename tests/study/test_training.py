@@ -81,7 +81,8 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, tiny: PpoSettin
         load_policy(out)
     told: list[int] = []
     train_policy("oracle", 0.4, 256, 0, out, settings=tiny, report=lambda done, *_: told.append(done))
-    assert told == [128, 192, 256]
+    assert told == [64, 128, 192, 256]  # the rollout that nothing was learnt from is collected again
+    assert RecurrentPPO.load(out / "policy.zip")._n_updates == 4
     assert not (out / CHECKPOINT_FILE).exists()
 
 
@@ -96,8 +97,8 @@ def test_a_resumed_run_meets_new_episodes(tmp_path: Path, tiny: PpoSettings, mon
 
     monkeypatch.setattr(RecurrentPPO, "learn", learn)
     with pytest.raises(KeyboardInterrupt):
-        train_policy("oracle", 0.4, 128, 0, tmp_path / "run", settings=tiny, report=interrupt_at(64))
-    train_policy("oracle", 0.4, 128, 0, tmp_path / "run", settings=tiny)
+        train_policy("oracle", 0.4, 192, 0, tmp_path / "run", settings=tiny, report=interrupt_at(128))
+    train_policy("oracle", 0.4, 192, 0, tmp_path / "run", settings=tiny)
     assert len(set(seeds)) == 8  # 4 environments, twice
     assert max(seeds) < CASE_SEED
 

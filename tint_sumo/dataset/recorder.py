@@ -94,7 +94,10 @@ def record(
         raise InputError(f"workers must be at least 1, not {workers}")
     claim_folder(out, recording.settings())
     if (out / MANIFEST).exists():
-        return read_json(out / MANIFEST, "dataset manifest")
+        manifest = read_json(out / MANIFEST, "dataset manifest")
+        parts = ((part, shard) for part in (TRAJECTORIES, DRIVERS) for shard in range(int(manifest.get("shards", 0))))
+        if all(shard_file(out, *part).exists() for part in parts):
+            return manifest
     for leftover in out.glob("*/.*.partial"):
         leftover.unlink()
     counts: list[int] = []
@@ -182,7 +185,7 @@ def _manifest(out: Path, recording: Recording, counts: list[int]) -> dict[str, A
 def _record_shard(recording: Recording, out: Path, shard: int) -> int:
     """Record one shard, unless it is there already, and return its number of windows."""
     file = shard_file(out, TRAJECTORIES, shard)
-    if file.exists():
+    if file.exists() and shard_file(out, DRIVERS, shard).exists():
         return int(pq.read_schema(file).metadata[_WINDOWS_KEY])
     trajectories, drivers = simulate_episodes(
         _simulation(recording.p_conservative), recording.seed, first_episode=shard * EPISODES_PER_SHARD

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
@@ -43,9 +43,9 @@ def load_windows(folder: Path) -> Windows:
     Raises:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
     """
-    _check(folder)
+    manifest = read_manifest(folder)
     columns = ["episode", "vehicle", "position_m", "gap_m"]
-    rows = _read(folder, TRAJECTORIES, columns)  # sorted by episode, vehicle and time
+    rows = _read(folder, TRAJECTORIES, columns, manifest["rows"])  # sorted by episode, vehicle and time
     return cut_windows(
         _driver_numbers(rows), rows["episode"].to_numpy(), rows["position_m"].to_numpy(), rows["gap_m"].to_numpy()
     )
@@ -80,7 +80,7 @@ def load_labels(folder: Path, windows: Windows) -> NDArray[np.bool_]:
     Raises:
         InputError: the labels are missing or do not belong to these windows.
     """
-    rows = _read(folder, DRIVERS, ["episode", "vehicle", "trait"])
+    rows = _read(folder, DRIVERS, ["episode", "vehicle", "trait"], read_manifest(folder)["drivers"])
     known = _driver_numbers(rows)
     row = pd.Index(known).get_indexer(pd.Index(windows.driver))
     if (row < 0).any():
@@ -97,23 +97,38 @@ def split_by_episode(windows: Windows, test_fraction: float, seed: int) -> tuple
     return np.flatnonzero(~in_test), np.flatnonzero(in_test)
 
 
-def _check(folder: Path) -> None:
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a dataset.
+
+    Raises:
+        InputError: there is none, it is damaged, or the dataset has another schema version.
+    """
     manifest = read_json(folder / MANIFEST, "dataset")
     found = manifest.get("schema_version")
     if found != SCHEMA_VERSION:
         raise InputError(
             f"{folder} has dataset schema version {found}, this tint_sumo reads {SCHEMA_VERSION}; record it anew"
         )
+    missing = [key for key in ("rows", "drivers", "windows", "seed", "p_conservative") if key not in manifest]
+    if missing:
+        raise InputError(f"{folder / MANIFEST} is damaged (no {', '.join(missing)}); record the dataset anew")
+    return manifest
 
 
-def _read(folder: Path, part: str, columns: list[str]) -> pd.DataFrame:
+def _read(folder: Path, part: str, columns: list[str], wanted: int) -> pd.DataFrame:
+    """Columns of all shards, which must have the wanted number of rows."""
     try:
-        return pd.read_parquet(folder / part, columns=columns)
+        rows = pd.read_parquet(folder / part, columns=columns)
     except FileNotFoundError:
         raise InputError(f"{folder / part} is missing; record the dataset anew") from None
     except (OSError, ValueError, KeyError) as error:  # pyarrow's own errors derive from these
         reason = str(error).splitlines()[0]
         raise InputError(f"{folder / part} is damaged ({reason}); record the dataset anew") from None
+    if len(rows) != wanted:
+        raise InputError(
+            f"{folder / part} has {len(rows)} of {wanted} rows; repeat the command that recorded the dataset"
+        )
+    return rows
 
 
 def _driver_numbers(rows: pd.DataFrame) -> NDArray[np.int64]:

@@ -1,5 +1,6 @@
 """Episodes of the navigation task in a batch of intersections: what all environment classes share."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -42,12 +43,10 @@ class TaskSettings:
     def __post_init__(self) -> None:
         if self.reward not in REWARD_PRESETS:
             raise InputError(f"unknown reward preset {self.reward!r}; choose one of {', '.join(REWARD_PRESETS)}")
-        if not self.time_limit_s > 0.0:
-            raise InputError(f"time_limit_s must be positive, not {self.time_limit_s}")
-        if not self.position_noise_m >= 0.0:
-            raise InputError(
-                f"position_noise_m is a standard deviation and must not be negative: {self.position_noise_m}"
-            )
+        if not EpisodeRules().step_s <= self.time_limit_s < math.inf:
+            raise InputError(f"time_limit_s must be at least a step of 0.1 s, and finite, not {self.time_limit_s}")
+        if not 0.0 <= self.position_noise_m < math.inf:
+            raise InputError(f"position_noise_m must be finite and not negative, not {self.position_noise_m}")
 
     @property
     def scenario(self) -> Scenario:
@@ -130,6 +129,8 @@ class Episodes:
 
     def step(self, actions: NDArray[np.integer]) -> Transition:
         simulation = self.simulation
+        if actions.shape != self.steps.shape or not ((actions >= 0) & (actions < len(self._speeds_mps))).all():
+            raise InputError(f"actions must be {len(self.steps)} of 0, 1, 2, not {actions.tolist()}")
         simulation.step(self._speeds_mps[actions])
         self.steps += 1
         self._measure(range(len(self.steps)))

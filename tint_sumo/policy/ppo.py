@@ -28,9 +28,11 @@ from tint_sumo.policy.buffer import SequenceBuffer, Sequences, buffer_class
 from tint_sumo.policy.network import GruPolicy
 
 _DEFAULTS = PpoSettings()
-_UNREADABLE = (  # what Stable-Baselines3 and torch raise for damaged files and for files of other models
-    ValueError, KeyError, RuntimeError, AssertionError, EOFError, zipfile.BadZipFile, zlib.error, pickle.UnpicklingError
-)  # fmt: skip
+# What Stable-Baselines3, torch and pickle raise for damaged files and for files of other models.
+_UNREADABLE = (
+    *(ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError, AssertionError, EOFError),
+    *(zipfile.BadZipFile, zlib.error, pickle.UnpicklingError),
+)
 _LINEAR = LinearSchedule(_DEFAULTS.learning_rate, 0.0, 1.0)
 
 

@@ -34,7 +34,7 @@ class Result:
         """Raises InputError if the file is damaged."""
         content = read_json(file, "result of a study")
         try:
-            cases = tuple(Case(*case) for case in content["cases"])
+            cases = tuple(Case(outcome, float(time_s), *hit) for outcome, time_s, *hit in content["cases"])
             result = cls(content["method"], float(content["p_conservative"]), int(content["seed"]), Evaluation(cases))
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{file} is damaged ({error!r}); remove it and run the study again") from None

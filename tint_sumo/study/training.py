@@ -1,6 +1,7 @@
 """Training of one policy: interruptible and resumable."""
 
 import hashlib
+import io
 import platform
 import time
 from collections import deque
@@ -21,7 +22,7 @@ from tint_sumo import traits as trait_models
 from tint_sumo.config import LATENT_SIZE, PpoSettings, Traffic
 from tint_sumo.envs.sb3 import TIntersectionVecEnv
 from tint_sumo.errors import InputError
-from tint_sumo.files import claim_folder, write_json
+from tint_sumo.files import claim_folder, whole_file, write_json
 from tint_sumo.policy import ActionRepeat, RecurrentPPO, TraitObservation
 from tint_sumo.study.evaluation import CASE_SEED, OUTCOMES, require_seed
 from tint_sumo.study.loading import CARD_FILE, POLICY_FILE
@@ -106,13 +107,15 @@ def _learn(venv: VecEnv, steps: int, seed: int, out: Path, settings: PpoSettings
     done = model.num_timesteps
     if done < steps:
         model.set_logger(configure(str(out / "tensorboard"), ["tensorboard"]))
+        if done:  # loading has set the random streams back to their beginning
+            model.set_random_seed(_training_seed(seed, done))
         venv.seed(_training_seed(seed, done))
         report(done, steps, "")
         watch = _Watch(checkpoint, steps, report)
         try:
             model.learn(steps - done, callback=watch, reset_num_timesteps=False)
         except KeyboardInterrupt:
-            model.save(checkpoint)
+            watch.write_checkpoint()
             raise
     model.save(out / POLICY_FILE)
 
@@ -142,7 +145,10 @@ def _training_seed(seed: int, done: int) -> int:
 
 
 class _Watch(BaseCallback):
-    """Saves checkpoints between rollouts, and reports the outcomes of recent episodes."""
+    """Keeps checkpoints, and reports the outcomes of recent episodes.
+
+    A checkpoint is the state between two rollouts: within one, steps are counted from which nothing is learnt yet.
+    """
 
     def __init__(self, checkpoint: Path, steps: int, report: Report) -> None:
         super().__init__()
@@ -151,11 +157,21 @@ class _Watch(BaseCallback):
         self._report = report
         self._recent: deque[str] = deque(maxlen=RECENT_EPISODES)
         self._saved_at = time.monotonic()
+        self._state = b""
 
     def _on_rollout_start(self) -> None:
+        state = io.BytesIO()
+        self.model.save(state)
+        self._state = state.getvalue()
         if time.monotonic() - self._saved_at >= CHECKPOINT_INTERVAL_S:
-            self.model.save(self._checkpoint)
+            self.write_checkpoint()
             self._saved_at = time.monotonic()
+
+    def write_checkpoint(self) -> None:
+        """Write the state at the start of the present rollout, if there is one."""
+        if self._state:
+            with whole_file(self._checkpoint) as partial:
+                partial.write_bytes(self._state)
 
     def _on_step(self) -> bool:
         infos: list[dict[str, Any]] = self.locals["infos"]

@@ -6,10 +6,8 @@ from typing import Any
 
 from tint_sumo import traits
 from tint_sumo.config import VaeSettings
-from tint_sumo.dataset.schema import MANIFEST
-from tint_sumo.dataset.windows import load_labels, load_windows, split_by_episode
+from tint_sumo.dataset.windows import load_labels, load_windows, read_manifest, split_by_episode
 from tint_sumo.errors import InputError
-from tint_sumo.files import read_json
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate, plot_latents
 from tint_sumo.traits.storage import read_card
 from tint_sumo.traits.training import train
@@ -35,8 +33,7 @@ def train_traits(
         raise InputError(f"seed must not be negative: {seed}")
     windows = load_windows(data)
     chosen, _ = split_by_episode(windows, TEST_FRACTION, seed)
-    manifest = read_json(data / MANIFEST, "dataset")
-    card = {"data": {key: manifest[key] for key in ("p_conservative", "seed", "windows")}}
+    card = {"data": _described(data)}
     train(windows[chosen], settings, out, method=method, seed=seed, progress=progress, card=card)
     return read_card(out / "model.safetensors")
 
@@ -56,6 +53,7 @@ def evaluate_traits(data: Path, model: str | Path, figure: Path | None = None) -
         InputError: no usable dataset or model.
     """
     trained = traits.load(model)
+    _require_unseen(data, model)
     windows = load_windows(data)
     labels = load_labels(data, windows)
     seed = int(read_card(model).get("seed", 0))
@@ -64,3 +62,22 @@ def evaluate_traits(data: Path, model: str | Path, figure: Path | None = None) -
         _, unseen = split_by_episode(windows, TEST_FRACTION, seed)
         plot_latents(trained, windows[unseen], labels[unseen], figure)
     return {"model": str(model), **asdict(found)}
+
+
+def _described(data: Path) -> dict[str, Any]:
+    manifest = read_manifest(data)
+    return {key: manifest[key] for key in ("p_conservative", "seed", "windows")}
+
+
+def _require_unseen(data: Path, model: str | Path) -> None:
+    """Raise InputError if the dataset shares episodes with the model's training, yet is not the same dataset.
+
+    Episodes follow from P and seed; a dataset of another size has them in common, but splits them otherwise.
+    """
+    trained_on = read_card(model).get("data") or {}
+    here = _described(data)
+    alike = all(trained_on.get(key) == here[key] for key in ("p_conservative", "seed"))
+    if alike and trained_on["windows"] != here["windows"]:
+        raise InputError(
+            f"{data} has episodes that {model} was trained on; record another dataset with --seed {here['seed'] + 1}"
+        )

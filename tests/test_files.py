@@ -1,10 +1,13 @@
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from tint_sumo.errors import InputError
-from tint_sumo.files import claim_folder, read_json, whole_file, write_json
+from tint_sumo.files import claim_folder, read_json, remove_leftovers, whole_file, write_json
 
 
 def test_a_file_is_whole_or_absent(tmp_path: Path) -> None:
@@ -60,6 +63,16 @@ def test_a_folder_with_other_files_or_a_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is a file, not a folder"):
         claim_folder(tmp_path / "letter", {"seed": 1})
     assert [file.name for file in tmp_path.iterdir()] == ["letter"]
+
+
+def test_leftovers_go_when_their_process_is_gone(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", "pass"]) as process:
+        process.wait()
+    gone, running = (tmp_path / f".a.{pid}.partial" for pid in (process.pid, os.getpid()))
+    for file in (gone, running):
+        file.write_text("half")
+    remove_leftovers(tmp_path)
+    assert list(tmp_path.iterdir()) == [running]
 
 
 def test_leftovers_of_a_killed_run_do_not_stand_in_the_way(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from tint_sumo.dataset.schema import (
     shard_file,
 )
 from tint_sumo.errors import InputError
-from tint_sumo.files import claim_folder, read_json, whole_file, write_json
+from tint_sumo.files import claim_folder, read_json, remove_leftovers, whole_file, write_json
 from tint_sumo.processes import SPAWN, end_with_parent
 from tint_sumo.scenario.geometry import LANE_DIRECTION, LANE_NAMES
 from tint_sumo.simulation.intersections import Intersections
@@ -98,8 +98,7 @@ def record(
         parts = ((part, shard) for part in (TRAJECTORIES, DRIVERS) for shard in range(int(manifest.get("shards", 0))))
         if all(shard_file(out, *part).exists() for part in parts):
             return manifest
-    for leftover in out.glob("*/.*.partial"):
-        leftover.unlink()
+    remove_leftovers(out)
     counts: list[int] = []
     with (
         tqdm(total=windows, desc="record", unit=" windows", disable=not progress) as bar,

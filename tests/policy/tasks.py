@@ -19,7 +19,24 @@ STREET = spaces.Dict(ego=box(4), vehicles=box(12, 2), mask=box(12))
 STREET_WITH_TRAITS = spaces.Dict({**STREET.spaces, "traits": box(12, 2)})
 
 
-class TinyVecEnv(VecEnv):
+class FakeVecEnv(VecEnv):
+    """What a VecEnv must have and no test here looks at."""
+
+    def close(self) -> None: ...
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [None] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None: ...
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        return []
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False] * self.num_envs
+
+
+class TinyVecEnv(FakeVecEnv):
     """Base of the tasks below: N environments in numpy that all end after ``length`` steps."""
 
     def __init__(self, num_envs: int, observation_space: spaces.Space, action_space: spaces.Space, length: int) -> None:
@@ -55,19 +72,6 @@ class TinyVecEnv(VecEnv):
                 info["episode"] = {"r": float(rewards[i]), "l": self.length, "t": 0.0}
             return self.reset(), rewards, done, infos
         return self.observe(), rewards, done, infos
-
-    def close(self) -> None: ...
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [None] * self.num_envs
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None: ...
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        return []
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        return [False] * self.num_envs
 
 
 class Memory(TinyVecEnv):

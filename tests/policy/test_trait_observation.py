@@ -4,19 +4,18 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo.config import POSITION_SCALE_M
 from tint_sumo.errors import InputError
 from tint_sumo.policy.trait_observation import EncoderTraits, NoTraits, OracleTraits, TraitObservation, TraitSource
 
-from .tasks import STREET, Memory
+from .tasks import STREET, FakeVecEnv, Memory
 
 LOWER_Y, UPPER_Y = 2.0, 6.0
 Scene = dict[int, tuple[float, float]]  # slot: centre (x, y) in m
 
 
-class Script(VecEnv):
+class Script(FakeVecEnv):
     """Environments that play scenes written by hand: ``episodes[env]`` is a list of episodes, an episode a list of
     (scene, ego's y), one each step. Traits are conservative in even slots, aggressive in odd ones."""
 
@@ -61,19 +60,6 @@ class Script(VecEnv):
         for info, label in zip(infos, labels, strict=True):
             info["traits"] = label
         return observations, np.zeros(self.num_envs, np.float32), done, infos
-
-    def close(self) -> None: ...
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [None] * self.num_envs
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None: ...
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        return []
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        return [False] * self.num_envs
 
 
 class Spy:

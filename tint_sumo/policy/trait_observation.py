@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from tint_sumo.config import LATENT_SIZE, MAX_VEHICLES, POSITION_SCALE_M, WINDOW_STEPS, Street, VehicleShape
 from tint_sumo.dataset.schema import NO_LEADER_GAP_M
 from tint_sumo.errors import InputError
+from tint_sumo.scenario.geometry import lane_border_y_m
 
 _NEEDED = frozenset({"ego", "vehicles", "mask"})
 
@@ -72,7 +73,7 @@ def _one_hot(labels: np.ndarray) -> np.ndarray:
     return np.stack([labels > 0, labels < 0], axis=-1).astype(np.float32)
 
 
-_LANE_BORDER_Y_M = Street.lower_y_m + Street.lane_width_m / 2.0  # between the lower and the upper lane
+_LANE_BORDER_Y_M = lane_border_y_m(Street())
 
 
 @dataclass

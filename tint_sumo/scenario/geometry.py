@@ -25,6 +25,11 @@ def lane_y_m(street: Street) -> Floats:
     return np.array([street.lower_y_m, street.upper_y_m])
 
 
+def lane_border_y_m(street: Street) -> float:
+    """Border between the lower and the upper lane."""
+    return street.lower_y_m + street.lane_width_m / 2
+
+
 def lane_length_m(street: Street, vehicle: VehicleShape) -> float:
     """Length of a lane: the street, and half a vehicle beyond it at either end."""
     return 2 * street.half_length_m + vehicle.length_m

@@ -18,7 +18,7 @@ import sumo
 
 from tint_sumo.config import Street, VehicleShape
 from tint_sumo.errors import InputError
-from tint_sumo.scenario.geometry import EgoPath, junction_span_m
+from tint_sumo.scenario.geometry import EgoPath, junction_span_m, lane_border_y_m
 
 LOWER_ROUTE = ("lower_in", "lower_out")
 UPPER_ROUTE = ("upper_in", "upper_out")
@@ -110,7 +110,7 @@ class _Replica:
     @property
     def _link_m(self) -> tuple[float, float]:
         """Path lengths between which the edge from the lower junction to the upper one lies."""
-        border_m = EgoPath(self.street, self.vehicle).crossing_m(self.street.lower_y_m + self.street.lane_width_m / 2)
+        border_m = EgoPath(self.street, self.vehicle).crossing_m(lane_border_y_m(self.street))
         return border_m - _HALF_LINK_M, border_m + _HALF_LINK_M
 
     def nodes(self) -> list[str]:
@@ -119,7 +119,7 @@ class _Replica:
         # lane's end just when its centre crosses the border.
         end = street.half_length_m + self.vehicle.length_m / 2
         low, high = street.lower_y_m - half_width, street.upper_y_m + half_width
-        middle = street.lower_y_m + half_width
+        middle = lane_border_y_m(street)
         (east, west), (upper_west, upper_east) = junction_span_m(street, self.vehicle).tolist()
         stem = half_width
         lower_shape = self._shape((-stem, low), (stem, low), (east, low), (east, middle), (west, middle), (west, low))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.config import POSITION_SCALE_M, SPEED_SCALE_MPS, EpisodeRules, Street, VehicleShape
+from tint_sumo.policy.trait_observation import is_upper
 
 Observation = dict[str, NDArray[np.float32]]
 State = tuple[NDArray[np.float64], ...]
@@ -13,7 +14,6 @@ State = tuple[NDArray[np.float64], ...]
 STOP, CREEP, GO = 0, 1, 2  # actions: desired speeds of 0, 0.5 and 3 m/s
 
 LOWER_EDGE_Y_M = Street.lower_y_m - Street.lane_width_m / 2  # where the stem ends
-LANE_BORDER_Y_M = Street.lower_y_m + Street.lane_width_m / 2  # between the lower and the upper lane
 
 _HALF_LENGTH_M = VehicleShape.length_m / 2
 
@@ -66,7 +66,7 @@ class TimeToCollision:
         """
         ego_m = observation["ego"][:, :2].astype(np.float64) * POSITION_SCALE_M
         centre_m = observation["vehicles"] * POSITION_SCALE_M + ego_m[:, None]
-        x_m, upper = centre_m[..., 0], centre_m[..., 1] > LANE_BORDER_Y_M
+        x_m, upper = centre_m[..., 0], is_upper(centre_m[..., 1])
         present = observation["mask"] > 0.5
         speed_mps = speeds_mps(x_m, present, upper, state, episode_start)
         blocking = present & (self.times_s(x_m, upper, speed_mps) <= self.threshold_s)

@@ -19,11 +19,12 @@ _DRIVERS_PER_EPISODE = 100_000
 
 @dataclass(frozen=True)
 class Windows:
-    """N windows of the states x of paper III-B; nothing in them tells the label."""
+    """N windows of the states x of paper III-B; nothing in them tells the label.
 
-    states: NDArray[
-        np.float32
-    ]  # (N, 20, 2): offset from the window's first position, gap to the leader; m; 0 at the end
+    A state is the offset from the window's first position and the gap to the leader, in m; zero after ``length``.
+    """
+
+    states: NDArray[np.float32]  # (N, 20, 2)
     length: NDArray[np.int64]  # (N,): valid steps, 2 to 20
     driver: NDArray[np.int64]  # (N,): one number per driver, the same in all its windows
     episode: NDArray[np.int64]  # (N,)

@@ -85,22 +85,17 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         transition = self._episodes.step(np.asarray(actions))
         done = transition.done
-        if not done.any():
-            infos = self._infos(transition)
-            observation = self._episodes.observe()
-        else:
-            final_infos, final = self._infos(transition), self._episodes.observe()
+        observation, infos = self._episodes.observe(), self._infos(transition)
+        if done.any():
             collisions = [self._episodes.collision_info(index) for index in range(self.num_envs)]
-            final_infos |= _masked({"collision": np.array(collisions, dtype=object)}, transition.collision)
-            for index in np.flatnonzero(done).tolist():
-                self._begin(index)
+            final_infos = infos | _masked({"collision": np.array(collisions, dtype=object)}, transition.collision)
             final_obs = np.full(self.num_envs, None, dtype=object)
             for index in np.flatnonzero(done).tolist():
-                final_obs[index] = {key: value[index] for key, value in final.items()}
-            infos = self._infos(transition)
+                final_obs[index] = {key: value[index] for key, value in observation.items()}
+                self._begin(index)
+            observation, infos = self._episodes.observe(), self._infos(transition)
             infos["outcome"] = np.where(done, "", infos["outcome"])
-            infos |= {"final_obs": final_obs, "_final_obs": done, "final_info": final_infos, "_final_info": done}
-            observation = self._episodes.observe()
+            infos |= _masked({"final_obs": final_obs, "final_info": final_infos}, done)
         return observation, transition.reward, transition.terminated, transition.timeout, infos
 
     def _infos(self, transition: Transition | None = None) -> dict[str, Any]:

@@ -260,6 +260,7 @@ class Intersections:
         self.vehicle_number[replica, slot] = number
         self._stage[replica, slot] = stage
         self._lane_pos_m[replica, slot] = position_m
+        self.front_m[replica, slot] = self._stage_start_m[lane, stage] + position_m
 
     def _forget(self, replica: int, slot: int) -> None:
         del self._slot_of[self._ids[replica][slot]]
@@ -322,13 +323,13 @@ class Intersections:
         # Vehicles only move forward: a lane position that dropped belongs to the next SUMO lane.
         self._stage[where] += position_m < self._lane_pos_m[where]
         self._lane_pos_m[where] = position_m
+        self.front_m[where] = self._stage_start_m[self.lane[where], self._stage[where]] + position_m
 
     def _admit(self) -> None:
         """Let the upcoming drivers in where there is room, a free slot, and their time has come."""
-        front_m = self._stage_start_m[self.lane, self._stage] + self._lane_pos_m
         entry_m = self.scenario.vehicle.length_m
         last_m = np.stack(
-            [np.where(self.present & (self.lane == lane), front_m, np.inf).min(axis=1) for lane in (LOWER, UPPER)],
+            [np.where(self.present & (self.lane == lane), self.front_m, np.inf).min(axis=1) for lane in (LOWER, UPPER)],
             axis=1,
         )
         # A lane without vehicles has room; a replica without an episode wants an infinite gap.
@@ -349,7 +350,6 @@ class Intersections:
         """Derive coordinates, and distances from the ego, of the given replicas."""
         street, shape = self.scenario.street, self.scenario.vehicle
         lane, present = self.lane[rows], self.present[rows]
-        self.front_m[rows] = self._stage_start_m[lane, self._stage[rows]] + self._lane_pos_m[rows]
         self.x_m[rows] = centre_x_m(self.front_m[rows], lane, street, shape)
         self.y_m[rows] = lane_y_m(street)[lane]
         if not self._with_ego:

@@ -317,7 +317,7 @@ def test_an_interrupted_training_goes_on(tmp_path: Path, capsys: pytest.CaptureF
     printed = Started(*argv).interrupt_at(r"[1-9]\d*/5000")
     assert "Traceback" not in printed
     assert "tint-sumo: interrupted" in printed
-    names = {path.name for path in (tmp_path / "run").iterdir()}
+    names = {path.name for path in (tmp_path / "run").glob("[!.]*")}
     assert names == {"run.json", "checkpoint.zip", "tensorboard"}
     run(capsys, *argv)
     assert (tmp_path / "run" / "policy.zip").exists()

@@ -7,9 +7,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from tint_sumo.errors import InputError
 
 RUN_FILE = "run.json"
+LOCK_FILE = ".lock"
+LOCK_TIMEOUT_S = 2.0  # workers of a killed process end a moment after it
 _PACKAGE = Path(__file__).resolve().parent
 
 
@@ -31,24 +35,6 @@ def whole_file(path: Path) -> Iterator[Path]:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files below ``folder`` that killed processes left; running ones keep theirs."""
-    for partial in folder.rglob(".*.partial"):
-        owner = partial.name.split(".")[-2]
-        if not (owner.isdigit() and _is_running(int(owner))):
-            partial.unlink(missing_ok=True)
-
-
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # somebody else's
-        return True
-    return True
 
 
 def write_text(path: Path, text: str) -> None:
@@ -77,13 +63,36 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     return value
 
 
-def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Make ``folder`` the home of the run described by ``settings``, or resume that very run.
+@contextmanager
+def claim_folder(folder: Path, settings: Mapping[str, Any]) -> Iterator[None]:
+    """In the block, ``folder`` is the home of the run described by ``settings``, a new one or that very run resumed.
+
+    One process at a time may work there; temporary files that killed processes left are removed.
 
     Raises:
-        InputError: the folder holds another run, or files of unknown origin.
+        InputError: the folder holds another run or files of unknown origin, or another process is working there.
     """
     wanted = json.loads(json.dumps(settings))
+    _require_home(folder, wanted)
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK_FILE, timeout=LOCK_TIMEOUT_S)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InputError(f"another process is working in {folder}; wait for it or choose another --out") from None
+    try:
+        _require_home(folder, wanted)
+        for partial in folder.rglob(".*.partial"):
+            partial.unlink(missing_ok=True)
+        if not (folder / RUN_FILE).exists():
+            write_json(folder / RUN_FILE, wanted)
+        yield
+    finally:
+        lock.release()
+
+
+def _require_home(folder: Path, wanted: Mapping[str, Any]) -> None:
+    """Raise InputError unless ``folder`` is absent, empty, or the home of the run ``wanted``."""
     run_file = folder / RUN_FILE
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder; choose another --out")
@@ -95,7 +104,5 @@ def claim_folder(folder: Path, settings: Mapping[str, Any]) -> None:
                 f"{folder} already holds another run (different: {', '.join(changed)}); "
                 "choose another --out or remove the folder"
             )
-    elif folder.exists() and any(entry.suffix != ".partial" for entry in folder.iterdir()):
+    elif folder.exists() and any(entry.suffix != ".partial" and entry.name != LOCK_FILE for entry in folder.iterdir()):
         raise InputError(f"{folder} already holds other files; choose another --out or an empty folder")
-    else:
-        write_json(run_file, wanted)

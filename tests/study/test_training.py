@@ -53,7 +53,7 @@ def test_a_run_leaves_a_policy_and_its_card(tmp_path: Path, tiny: PpoSettings) -
     assert card["settings"]["n_steps"] == 16
     assert "libsumo" in card["versions"]
     assert list((out / "tensorboard").iterdir())
-    assert sorted(path.name for path in out.iterdir()) == ["policy.json", "policy.zip", "run.json", "tensorboard"]
+    assert sorted(path.name for path in out.glob("[!.]*")) == ["policy.json", "policy.zip", "run.json", "tensorboard"]
 
 
 def test_a_finished_run_is_not_repeated(tmp_path: Path, tiny: PpoSettings) -> None:
@@ -76,7 +76,7 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, tiny: PpoSettin
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         train_policy("oracle", 0.4, 256, 0, out, settings=tiny, report=interrupt_at(128))
-    assert sorted(path.name for path in out.iterdir()) == [CHECKPOINT_FILE, "run.json", "tensorboard"]
+    assert sorted(path.name for path in out.glob("[!.]*")) == [CHECKPOINT_FILE, "run.json", "tensorboard"]
     with pytest.raises(InputError, match="not finished"):
         load_policy(out)
     told: list[int] = []

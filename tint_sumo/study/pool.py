@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from tint_sumo.errors import InputError
 from tint_sumo.processes import SPAWN, end_with_parent
+from tint_sumo.progress import make_bar
 from tint_sumo.study.progress import Report
 
 REFRESH_S = 1.0
@@ -74,7 +75,7 @@ def run_jobs(jobs: Sequence[Job], workers: int, progress: bool = True) -> None:
 
 
 def _global_bar(jobs: int, waiting: int, progress: bool) -> "tqdm[NoReturn]":
-    return tqdm(desc="study", total=jobs, initial=jobs - waiting, unit="job", disable=not progress)
+    return make_bar(desc="study", total=jobs, initial=jobs - waiting, unit="job", disable=not progress)
 
 
 def _heard_from(running: "Sequence[_Worker]") -> "list[_Worker]":
@@ -93,7 +94,7 @@ class _Worker:
         self.line = line
         # Where bars cannot be redrawn in place, as in a log file, the global one is enough.
         hidden = not (progress and sys.stderr.isatty())
-        self.bar: tqdm[NoReturn] = tqdm(desc=job.name, total=1, position=line, leave=False, disable=hidden)
+        self.bar: tqdm[NoReturn] = make_bar(desc=job.name, total=1, position=line, leave=False, disable=hidden)
         self.pipe, theirs = SPAWN.Pipe(duplex=False)
         self._process = SPAWN.Process(target=_work, args=(job, theirs), daemon=True)
         with _interrupts_blocked():

@@ -6,6 +6,8 @@ from typing import NoReturn
 
 from tqdm import tqdm
 
+from tint_sumo.progress import make_bar
+
 Report = Callable[[int, int, str], None]  # takes what is done, of how much, and a short note
 
 
@@ -20,7 +22,7 @@ def progress_bar(description: str, unit: str) -> Iterator[Report]:
 
     def report(done: int, total: int, note: str) -> None:
         if not bars:  # what an earlier run did says nothing about this one's speed
-            bars.append(tqdm(desc=description, unit=unit, total=total, initial=done))
+            bars.append(make_bar(desc=description, unit=unit, total=total, initial=done))
         bars[0].set_postfix_str(note, refresh=False)
         bars[0].update(done - bars[0].n)
 

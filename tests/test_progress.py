@@ -1,0 +1,35 @@
+"""Bars on a terminal and in a log file."""
+
+import os
+import time
+
+import pytest
+
+from tests.terminal import look, open_terminal
+from tint_sumo.progress import make_bar
+
+
+def work() -> None:
+    with make_bar(total=6, desc="work") as bar:
+        for _ in range(6):
+            time.sleep(0.12)
+            bar.update()
+
+
+def test_in_a_log_file_a_bar_shows_its_start_and_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+    work()
+    shown = [line for line in capsys.readouterr().err.split("\r") if line.strip()]
+    assert len(shown) == 2
+    assert "0/6" in shown[0]
+    assert "6/6" in shown[1]
+
+
+def test_on_a_terminal_it_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = open_terminal()
+    with os.fdopen(theirs, "w") as terminal:
+        monkeypatch.setattr("sys.stderr", terminal)
+        work()
+        terminal.flush()
+        shown = look(ours, 10.0)
+    os.close(ours)
+    assert all(f"{done}/6" in shown for done in range(7))

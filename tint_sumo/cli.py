@@ -75,12 +75,19 @@ class Record(Command):
     """Seed of the traffic."""
     workers: int = 1
     """Processes that simulate; the dataset does not depend on their number."""
+    format: Literal["parquet", "fcd"] = "parquet"
+    """Parquet is always written; fcd: SUMO's floating-car data, too, also for a dataset that is there already."""
 
     def run(self) -> Outcome:
         from tint_sumo.dataset.recorder import record
 
         manifest = record(
-            self.out, self.windows, p_conservative=self.p_conservative, seed=self.seed, workers=self.workers
+            self.out,
+            self.windows,
+            p_conservative=self.p_conservative,
+            seed=self.seed,
+            workers=self.workers,
+            fcd=self.format == "fcd",
         )
         return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
 

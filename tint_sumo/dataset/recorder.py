@@ -1,17 +1,19 @@
 """Record the traffic without the ego (paper III-B) to Parquet, shard by shard.
 
 A shard is a fixed number of episodes whose seeds follow from the dataset's seed and the shard's number, so that the
-dataset does not depend on the number of workers, and an interrupted recording resumes to the very same dataset.
+dataset does not depend on the number of workers, and an interrupted recording resumes to the very same dataset. No more
+than a shard per process is in memory at a time.
 """
 
 import platform
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +24,21 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from tint_sumo.config import MAX_VEHICLES, WINDOW_STEPS, Scenario, Traffic
+from tint_sumo.dataset.fcd import write_fcd
 from tint_sumo.dataset.schema import (
     DRIVER_SCHEMA,
     DRIVERS,
+    FCD,
     MANIFEST,
     NO_LEADER_GAP_M,
     SCHEMA_VERSION,
+    TABLES,
     TRAJECTORIES,
     TRAJECTORY_SCHEMA,
+    read_shard,
+    read_shard_metadata,
     shard_file,
+    shard_number,
 )
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, read_json, whole_file, write_json
@@ -85,11 +93,13 @@ def record(
     p_conservative: float = 0.5,
     seed: int = 0,
     workers: int = 1,
+    fcd: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Record a dataset of at least ``windows`` windows into ``out`` and return its manifest.
 
-    The same call resumes an interrupted recording; a finished one is left as it is.
+    The same call resumes an interrupted recording; a finished one is left as it is. With ``fcd`` the trajectories are
+    written as SUMO's floating-car data, too, also those of a dataset that is there already.
 
     Raises:
         InputError: bad values, or ``out`` holds another run.
@@ -98,29 +108,31 @@ def record(
     if workers < 1:
         raise InputError(f"workers must be at least 1, not {workers}")
     with claim_folder(out, recording.settings()):
-        finished = _finished(out)
-        return _record(recording, out, workers, progress) if finished is None else finished
+        finished = _finished(out, fcd)
+        return _record(recording, out, fcd, workers, progress) if finished is None else finished
 
 
-def _finished(out: Path) -> dict[str, Any] | None:
+def _finished(out: Path, fcd: bool) -> dict[str, Any] | None:
     """The manifest of a complete dataset."""
     if not (out / MANIFEST).exists():
         return None
     manifest = read_json(out / MANIFEST, "dataset manifest")
-    parts = ((part, shard) for part in (TRAJECTORIES, DRIVERS) for shard in range(int(manifest.get("shards", 0))))
-    return manifest if all(shard_file(out, *part).exists() for part in parts) else None
+    parts = (*TABLES, FCD) if fcd else TABLES
+    shards = range(int(manifest.get("shards", 0)))
+    return manifest if all(shard_file(out, part, shard).exists() for part in parts for shard in shards) else None
 
 
-def _record(recording: Recording, out: Path, workers: int, progress: bool) -> dict[str, Any]:
+def _record(recording: Recording, out: Path, fcd: bool, workers: int, progress: bool) -> dict[str, Any]:
     windows = recording.windows
+    record_shard = partial(_record_shard, recording, out, fcd)
     counts: list[int] = []
     with (
         make_bar(total=windows, desc="record", unit=" windows", disable=not progress) as bar,
-        _shards(recording, out, workers) as shards,
+        _shards(record_shard, workers) as shards,
     ):
-        for count in shards:
-            counts.append(count)
-            bar.update(min(count, windows - bar.n))
+        for found in shards:
+            counts.append(found)
+            bar.update(min(found, windows - bar.n))
             if sum(counts) >= windows:
                 break
     _remove_shards_from(out, len(counts))
@@ -130,34 +142,27 @@ def _record(recording: Recording, out: Path, workers: int, progress: bool) -> di
 
 
 @contextmanager
-def _shards(recording: Recording, out: Path, workers: int) -> Iterator[Iterator[int]]:
+def _shards(record_shard: Callable[[int], int], workers: int) -> Iterator[Iterator[int]]:
     """Window counts of shards 0, 1, ..., recorded here or, ahead of their use, in worker processes."""
     if workers == 1:
         try:
-            yield (_record_shard(recording, out, shard) for shard in _naturals())
+            yield map(record_shard, count())
         finally:
             _simulation.cache_clear()  # ends the simulation: libsumo is free again
         return
     with ProcessPoolExecutor(workers, SPAWN, initializer=_start_worker) as pool:
         try:
-            yield _ahead(pool, recording, out, workers)
+            yield _ahead(pool, record_shard, workers)
         finally:
             pool.shutdown(cancel_futures=True)
 
 
-def _ahead(pool: ProcessPoolExecutor, recording: Recording, out: Path, workers: int) -> Iterator[int]:
+def _ahead(pool: ProcessPoolExecutor, record_shard: Callable[[int], int], workers: int) -> Iterator[int]:
     pending: list[Future[int]] = []
-    for shard in _naturals():
-        pending.append(pool.submit(_record_shard, recording, out, shard))
+    for shard in count():
+        pending.append(pool.submit(record_shard, shard))
         if len(pending) > workers:
             yield pending.pop(0).result()
-
-
-def _naturals() -> Iterator[int]:
-    number = 0
-    while True:
-        yield number
-        number += 1
 
 
 def _start_worker() -> None:
@@ -168,16 +173,16 @@ def _start_worker() -> None:
 
 def _remove_shards_from(out: Path, first: int) -> None:
     """Workers run ahead: drop what they recorded beyond the last shard needed."""
-    for part in (TRAJECTORIES, DRIVERS):
-        for file in (out / part).glob("shard-*.parquet"):
-            if int(file.stem.split("-")[1]) >= first:
+    for part in (*TABLES, FCD):
+        for file in (out / part).glob("shard-*"):
+            if shard_number(file) >= first:
                 file.unlink()
 
 
 def _manifest(out: Path, recording: Recording, counts: list[int]) -> dict[str, Any]:
     rows = {
-        part: sum(pq.read_metadata(shard_file(out, part, shard)).num_rows for shard in range(len(counts)))
-        for part in (TRAJECTORIES, DRIVERS)
+        part: sum(read_shard_metadata(shard_file(out, part, shard)).num_rows for shard in range(len(counts)))
+        for part in TABLES
     }
     return {
         **recording.settings(),
@@ -195,19 +200,24 @@ def _manifest(out: Path, recording: Recording, counts: list[int]) -> dict[str, A
     }
 
 
-def _record_shard(recording: Recording, out: Path, shard: int) -> int:
-    """Record one shard, unless it is there already, and return its number of windows."""
+def _record_shard(recording: Recording, out: Path, fcd: bool, shard: int) -> int:
+    """Record one shard, as far as it is not there already, and return its number of windows."""
     file = shard_file(out, TRAJECTORIES, shard)
-    if file.exists() and shard_file(out, DRIVERS, shard).exists():
-        return int(pq.read_schema(file).metadata[_WINDOWS_KEY])
+    if not (file.exists() and shard_file(out, DRIVERS, shard).exists()):
+        _record_tables(recording, out, shard)
+    if fcd and not shard_file(out, FCD, shard).exists():
+        write_fcd(read_shard(file), shard_file(out, FCD, shard))
+    return int(read_shard_metadata(file).metadata[_WINDOWS_KEY])
+
+
+def _record_tables(recording: Recording, out: Path, shard: int) -> None:
     trajectories, drivers = simulate_episodes(
         _simulation(recording.p_conservative), recording.seed, first_episode=shard * EPISODES_PER_SHARD
     )
-    windows = count_windows(trajectories)
-    # The trajectories come last: where they are, the shard is complete.
+    windows = str(count_windows(trajectories)).encode()
+    # The trajectories come last: where they are, the shard's tables are complete.
     _write(shard_file(out, DRIVERS, shard), drivers, DRIVER_SCHEMA, {})
-    _write(file, trajectories, TRAJECTORY_SCHEMA, {_WINDOWS_KEY: str(windows).encode()})
-    return windows
+    _write(shard_file(out, TRAJECTORIES, shard), trajectories, TRAJECTORY_SCHEMA, {_WINDOWS_KEY: windows})
 
 
 @cache

@@ -1,19 +1,28 @@
 """What a recorded dataset holds, and how it lies on disk.
 
 A dataset folder has ``trajectories/`` (one row per vehicle and step) and, apart from it, ``drivers/`` (one row per
-driver, with the trait label), each one Parquet file per shard, and ``manifest.json``, written last.
+driver, with the trait label), each one Parquet file per shard, and ``manifest.json``, written last. ``fcd/``, if asked
+for, tells the trajectories once more, as SUMO does.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from tint_sumo.config import Street
+from tint_sumo.errors import InputError
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 TRAJECTORIES = "trajectories"
 DRIVERS = "drivers"
+TABLES = (TRAJECTORIES, DRIVERS)
+FCD = "fcd"
+_SUFFIX = {TRAJECTORIES: "parquet", DRIVERS: "parquet", FCD: "xml.gz"}
 
 # Stands for the gap of every driver without a leader, whatever the driver's trait, and caps all gaps: half the street.
 NO_LEADER_GAP_M = Street().half_length_m
@@ -55,4 +64,42 @@ DRIVER_SCHEMA = pa.schema(
 
 
 def shard_file(folder: Path, part: str, shard: int) -> Path:
-    return folder / part / f"shard-{shard:05d}.parquet"
+    return folder / part / f"shard-{shard:05d}.{_SUFFIX[part]}"
+
+
+def shard_number(file: Path) -> int:
+    """Of a path made by :func:`shard_file`."""
+    return int(file.name.removeprefix("shard-").split(".")[0])
+
+
+def read_shard(file: Path, columns: list[str] | None = None) -> pd.DataFrame:
+    """The rows of one Parquet file.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    with _mendable(file):
+        return pd.read_parquet(file, columns=columns)
+
+
+def read_shard_metadata(file: Path) -> pq.FileMetaData:
+    """Number of rows and the file's own key-value metadata.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    with _mendable(file):
+        return pq.read_metadata(file)
+
+
+@contextmanager
+def _mendable(file: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(f"{file} is missing; repeat the command that recorded the dataset") from None
+    except (OSError, ValueError, KeyError) as error:  # pyarrow's own errors derive from these
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"{file} is damaged ({reason}); remove it and repeat the command that recorded the dataset"
+        ) from None

@@ -1,3 +1,3 @@
-from tests.dataset.test_recorder import dataset
+from tests.dataset.test_recorder import dataset, two_shards
 
-__all__ = ["dataset"]
+__all__ = ["dataset", "two_shards"]

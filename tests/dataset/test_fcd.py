@@ -1,6 +1,7 @@
 """Floating-car data, as SUMO's own tools see it."""
 
 import gzip
+import shutil
 from pathlib import Path
 
 import libsumo
@@ -10,7 +11,7 @@ import pytest
 import sumolib
 from sumolib.geomhelper import positionAtShapeOffset
 
-from tests.dataset.test_recorder import contents
+from tests.dataset.test_recorder import WINDOWS, contents
 from tint_sumo.dataset.fcd import EPISODE_PERIOD_S, VEHICLE_TYPE, write_fcd
 from tint_sumo.dataset.recorder import record, simulate_episodes
 from tint_sumo.dataset.schema import FCD, TRAJECTORIES
@@ -124,15 +125,13 @@ def test_sumo_writes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert np.isclose(ours[NUMBERS], theirs[NUMBERS], atol=1e-9).mean() > 0.999
 
 
-def test_recording_it_does_not_depend_on_workers_and_leaves_the_tables_alone(tmp_path: Path) -> None:
-    both, later = tmp_path / "both", tmp_path / "later"
-    record(both, 5000, fcd=True, workers=2, progress=False)
-    record(later, 5000, progress=False)
-    tables = contents(later)
-    assert not (later / FCD).exists()
-    record(later, 5000, fcd=True, progress=False)
-    assert contents(later) == contents(both)
-    assert tables.items() < contents(later).items()
-    assert {name for name in contents(later) if name.startswith(FCD)} == {
-        f"{FCD}/shard-0000{shard}.xml.gz" for shard in range(2)
-    }
+def test_a_finished_dataset_gets_it_without_simulating(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(dataset, copy)
+    monkeypatch.delattr("tint_sumo.dataset.recorder.simulate_episodes")
+    record(copy, WINDOWS, seed=1, fcd=True, progress=False)
+    assert contents(dataset).items() < contents(copy).items()
+    write_fcd(pd.read_parquet(next((dataset / TRAJECTORIES).iterdir())), tmp_path / "expected.xml.gz")
+    assert contents(copy)[f"{FCD}/shard-00000.xml.gz"] == (tmp_path / "expected.xml.gz").read_bytes()

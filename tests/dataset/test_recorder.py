@@ -1,10 +1,6 @@
-"""Recording, with real simulations and real kills."""
+"""Recording, with real simulations."""
 
-import os
-import signal
-import subprocess
-import sys
-import time
+import json
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +21,14 @@ TWO_SHARDS = 5000
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dataset")
     record(folder, WINDOWS, seed=1, progress=False)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def two_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two shards with floating-car data, recorded without interruption."""
+    folder = tmp_path_factory.mktemp("two_shards")
+    record(folder, TWO_SHARDS, fcd=True, progress=False)
     return folder
 
 
@@ -114,58 +118,17 @@ def test_the_share_of_conservative_drivers_is_the_one_asked_for(tmp_path: Path) 
     assert (drivers["trait"] == "conservative").mean() == pytest.approx(0.25, abs=spread)
 
 
-def test_the_dataset_does_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
-    one = record(tmp_path / "one", TWO_SHARDS, progress=False)
-    two = record(tmp_path / "two", TWO_SHARDS, workers=2, progress=False)
-    assert one == two
-    assert one["shards"] == 2
-    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+def test_the_dataset_does_not_depend_on_the_number_of_workers(two_shards: Path, tmp_path: Path) -> None:
+    manifest = record(tmp_path, TWO_SHARDS, workers=2, fcd=True, progress=False)
+    assert manifest == json.loads((two_shards / MANIFEST).read_text())
+    assert manifest["shards"] == 2
+    assert contents(tmp_path) == contents(two_shards)
 
 
 def test_recording_again_leaves_a_finished_dataset_alone(dataset: Path) -> None:
     before = {file: file.stat().st_mtime_ns for file in dataset.rglob("*")}
     record(dataset, WINDOWS, seed=1, progress=False)
     assert {file: file.stat().st_mtime_ns for file in dataset.rglob("*")} == before
-
-
-def wait_for_workers(mark: str) -> None:
-    """Workers must end with the process that started them."""
-    deadline = time.monotonic() + 20
-    while any(mark in _environment(process) for process in Path("/proc").glob("[0-9]*")):
-        assert time.monotonic() < deadline, "a worker outlives the main process"
-        time.sleep(0.05)
-
-
-def _environment(process: Path) -> str:
-    try:
-        return (process / "environ").read_bytes().decode(errors="replace")
-    except OSError:  # it has just ended
-        return ""
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
-def test_a_killed_recording_resumes_to_the_very_dataset(tmp_path: Path, sent: signal.Signals, workers: int) -> None:
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    record(whole, TWO_SHARDS, progress=False)
-    call = f"if __name__ == '__main__':\n    record(Path(r'{killed}'), {TWO_SHARDS}, workers={workers})\n"
-    script = tmp_path / "script.py"
-    script.write_text(f"from pathlib import Path\nfrom tint_sumo.dataset.recorder import record\n{call}")
-    marked = {**os.environ, "RECORDING": str(script)}  # inherited by the workers
-    process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.DEVNULL, env=marked)
-    deadline = time.monotonic() + 60
-    while not list(killed.glob(f"{TRAJECTORIES}/shard-*.parquet")):
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.01)
-    os.kill(process.pid, sent)
-    process.wait()
-    wait_for_workers(str(script))
-    assert not (killed / MANIFEST).exists()
-    for file in killed.glob("*/shard-*.parquet"):
-        pd.read_parquet(file)  # whole
-    record(killed, TWO_SHARDS, progress=False)
-    assert contents(killed) == contents(whole)
-    assert (killed / MANIFEST).read_bytes() == (whole / MANIFEST).read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ PATIENCE_S = 100.0
 COMMANDS = (
     "net",
     "record",
+    "dataset inspect",
     "traits train",
     "traits evaluate",
     "policy train",
@@ -150,6 +151,27 @@ def test_policy_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
     assert low <= printed["success"] <= high
 
 
+def test_record_in_the_format_of_sumo(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = copy(dataset, tmp_path / "copy")
+    run(capsys, "record", "--windows", 100, "--out", out, "--format", "fcd")
+    assert (out / "fcd" / "shard-00000.xml.gz").exists()
+    assert {path: content for path, content in files(out).items() if "fcd" not in path.parts} == {
+        out / path.relative_to(dataset): content for path, content in files(dataset).items()
+    }
+
+
+def test_dataset_inspect(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    printed = run(capsys, "dataset", "inspect", dataset)
+    manifest = json.loads((dataset / "manifest.json").read_text())
+    assert printed["manifest"] == manifest
+    assert sum(trait["rows"] for trait in printed["traits"].values()) == manifest["rows"]
+    assert main(["dataset", "inspect", str(dataset), "--figure", str(tmp_path / "figure.png")]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"windows +\d+\n", text)
+    assert "aggressive, gap to the leader (m)" in text
+    assert f"wrote {tmp_path / 'figure.png'}" in text
+
+
 def test_policy_train(tmp_path: Path, trait_model: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     argv = ("policy", "train", "--method", "ours", "--steps", 1, "--traits", trait_model, "--out", out)
@@ -188,6 +210,7 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ("record --p-conservative 1.5 --out OUT", "p_conservative"),
         ("record --windows 0 --out OUT", "windows"),
         ("record --seed -1 --out OUT", "seed"),
+        ("dataset inspect NOWHERE", "dataset"),
         ("traits train --data NOWHERE --out OUT", "dataset"),
         ("traits train --data DATA --method magic --out OUT", "unknown trait method 'magic'"),
         ("traits train --data DATA --seed -1 --out OUT", "seed"),
@@ -276,6 +299,9 @@ def test_a_damaged_dataset(
     shard = next((other / "trajectories").iterdir())
     shard.write_bytes(shard.read_bytes()[:100])
     assert "damaged" in refuse(capsys, "traits", "evaluate", "--model", trait_model, "--data", other)
+    for argv in (f"dataset inspect {other}", f"record --windows 100 --out {other} --format fcd"):
+        assert main(argv.split()) == 2
+        assert "is damaged" in capsys.readouterr().err.splitlines()[-1]  # behind the progress bar
 
 
 def test_damaged_models(dataset: Path, trait_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

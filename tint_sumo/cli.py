@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, Positional, Suppress, subcommand
 
 from tint_sumo.errors import InputError
 
@@ -90,6 +90,26 @@ class Record(Command):
             fcd=self.format == "fcd",
         )
         return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectDataset(Command):
+    """Tell what is in a dataset: counts, settings, and distributions of speed and gap per driver trait."""
+
+    data: Positional[Path]
+    """Folder of a dataset."""
+    figure: Path | None = None
+    """Where a PNG of the distributions goes."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.dataset.inspection import inspect, plot, report
+
+        found = inspect(self.data)
+        text = report(found)
+        if self.figure is not None:
+            plot(found, self.figure)
+            text += f"\nwrote {self.figure}"
+        return Outcome(text, {"data": str(self.data), **found.summary()})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,6 +281,14 @@ class ReportStudy(Command):
         return _report_outcome(write_report(self.out))
 
 
+# tyro makes subcommands of unions only, hence the None.
+@dataclass(frozen=True)
+class Dataset:
+    """Recorded datasets."""
+
+    command: Annotated[InspectDataset, subcommand("inspect")] | Suppress[None]
+
+
 @dataclass(frozen=True)
 class Traits:
     """Driver traits learnt from trajectories."""
@@ -289,6 +317,7 @@ class TintSumo:
     command: (
         Annotated[Net, subcommand("net")]
         | Annotated[Record, subcommand("record")]
+        | Annotated[Dataset, subcommand("dataset")]
         | Annotated[Traits, subcommand("traits")]
         | Annotated[Policy, subcommand("policy")]
         | Annotated[Study, subcommand("study")]

@@ -1,0 +1,236 @@
+"""What is in a recorded dataset: counts, and distributions per trait.
+
+Shards are read one after the other and only counts of rounded values are kept, so that memory does not grow with the
+dataset. Labels are joined here to describe the data; no input of a model comes from here.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import PercentFormatter
+from numpy.typing import NDArray
+
+from tint_sumo.config import DRIVER_PROFILES, DriverProfile
+from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, read_shard, shard_file
+from tint_sumo.dataset.windows import read_manifest
+from tint_sumo.errors import InputError
+from tint_sumo.files import whole_file
+from tint_sumo.progress import make_bar
+
+RESOLUTION = 0.01  # m, m/s or s: values are rounded to multiples of it
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+_KEYS = ["episode", "vehicle"]
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """How often each value occurs, values rounded to 0.01."""
+
+    value: NDArray[np.float64]  # (K,), increasing
+    count: NDArray[np.int64]  # (K,)
+
+    @classmethod
+    def of(cls, values: pd.Series) -> "Distribution":
+        """Of the values that are not null."""
+        level, count = np.unique(np.rint(values.dropna().to_numpy(np.float64) / RESOLUTION), return_counts=True)
+        return cls(level * RESOLUTION, count)
+
+    def __add__(self, other: "Distribution") -> "Distribution":
+        value, index = np.unique(np.rint(np.r_[self.value, other.value] / RESOLUTION), return_inverse=True)
+        count = np.bincount(index, np.r_[self.count, other.count], len(value)).astype(np.int64)
+        return Distribution(value * RESOLUTION, count)
+
+    def quantile(self, fraction: float) -> float:
+        """The smallest value that at least this fraction does not exceed."""
+        reached = np.cumsum(self.count) >= fraction * self.count.sum()
+        return round(float(self.value[reached.argmax()]), 2)
+
+    def summary(self) -> dict[str, Any]:
+        """count, mean, sd, min, quantiles and max; the count alone if there is nothing."""
+        total = int(self.count.sum())
+        if total == 0:
+            return {"count": 0}
+        mean = float(self.value @ self.count) / total
+        variance = float((self.value - mean) ** 2 @ self.count) / total
+        return {
+            "count": total,
+            "mean": round(mean, 4),
+            "sd": round(variance**0.5, 4),
+            "min": self.quantile(0.0),
+            **{f"q{fraction:.0%}".rstrip("%"): self.quantile(fraction) for fraction in QUANTILES},
+            "max": self.quantile(1.0),
+        }
+
+
+NOTHING = Distribution(np.empty(0), np.empty(0, np.int64))
+
+
+@dataclass(frozen=True)
+class TraitStatistics:
+    """Of all drivers with one trait."""
+
+    drivers: int = 0
+    rows: int = 0
+    speed_mps: Distribution = NOTHING
+    gap_m: Distribution = NOTHING  # of rows with a leader
+    track_s: Distribution = NOTHING  # time on the street
+
+    def __add__(self, other: "TraitStatistics") -> "TraitStatistics":
+        return TraitStatistics(
+            self.drivers + other.drivers,
+            self.rows + other.rows,
+            self.speed_mps + other.speed_mps,
+            self.gap_m + other.gap_m,
+            self.track_s + other.track_s,
+        )
+
+    def summary(self) -> dict[str, Any]:
+        return {
+            "drivers": self.drivers,
+            "rows": self.rows,
+            "speed_mps": self.speed_mps.summary(),
+            "gap_m": self.gap_m.summary(),
+            "track_s": self.track_s.summary(),
+        }
+
+
+@dataclass(frozen=True)
+class Inspection:
+    manifest: Mapping[str, Any]
+    traits: Mapping[str, TraitStatistics]  # by name of the trait
+    episode_s: Distribution
+    drivers_per_episode: Distribution
+
+    def summary(self) -> dict[str, Any]:
+        """What JSON can hold of it."""
+        return {
+            "manifest": dict(self.manifest),
+            "traits": {trait: one.summary() for trait, one in self.traits.items()},
+            "episode_s": self.episode_s.summary(),
+            "drivers_per_episode": self.drivers_per_episode.summary(),
+        }
+
+
+def inspect(folder: Path, progress: bool = True) -> Inspection:
+    """Go through a dataset, labels included.
+
+    Raises:
+        InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
+    """
+    manifest = read_manifest(folder)
+    traits = {profile.name: TraitStatistics() for profile in DRIVER_PROFILES}
+    episode_s = drivers_per_episode = NOTHING
+    for rows in _shards(folder, manifest, progress):
+        for trait in traits:
+            traits[trait] += _statistics(rows[rows["trait"] == trait])
+        episodes = rows.groupby("episode")
+        episode_s += Distribution.of(episodes["time_s"].max())
+        drivers_per_episode += Distribution.of(episodes["vehicle"].nunique())
+    found = sum(one.rows for one in traits.values())
+    if found != manifest["rows"]:
+        raise InputError(
+            f"{folder} has {found} of {manifest['rows']} rows with their drivers; "
+            "repeat the command that recorded the dataset"
+        )
+    return Inspection(manifest, traits, episode_s, drivers_per_episode)
+
+
+def _shards(folder: Path, manifest: Mapping[str, Any], progress: bool) -> Iterator[pd.DataFrame]:
+    """Rows of each shard with their drivers' traits."""
+    columns = [*_KEYS, "time_s", "speed_mps", "gap_m"]
+    shards = int(manifest.get("shards", 0))
+    with make_bar(total=shards, desc="inspect", unit="shard", disable=not progress) as bar:
+        for shard in range(shards):
+            rows = read_shard(shard_file(folder, TRAJECTORIES, shard), columns)
+            drivers = read_shard(shard_file(folder, DRIVERS, shard), [*_KEYS, "trait"])
+            yield rows.merge(drivers, on=_KEYS)
+            bar.update()
+
+
+def _statistics(rows: pd.DataFrame) -> TraitStatistics:
+    tracks = rows.groupby(_KEYS)["time_s"]
+    track_s = tracks.max() - tracks.min()
+    return TraitStatistics(
+        len(track_s),
+        len(rows),
+        Distribution.of(rows["speed_mps"]),
+        Distribution.of(rows["gap_m"]),
+        Distribution.of(track_s),
+    )
+
+
+def report(inspection: Inspection) -> str:
+    """The manifest and the distributions, for people."""
+    width = max(map(len, inspection.manifest))
+    lines = [f"{key:{width}}  {_told(value)}" for key, value in inspection.manifest.items()]
+    table = {
+        "drivers per episode": inspection.drivers_per_episode,
+        "episode (s)": inspection.episode_s,
+        **{
+            f"{trait}, {name}": distribution
+            for trait, one in inspection.traits.items()
+            for name, distribution in (
+                ("speed (m/s)", one.speed_mps),
+                ("gap to the leader (m)", one.gap_m),
+                ("time on the street (s)", one.track_s),
+            )
+        },
+    }
+    summaries = pd.DataFrame.from_dict({name: one.summary() for name, one in table.items()}, orient="index")
+    return "\n".join([*lines, "", summaries.to_string(na_rep="")])
+
+
+def _told(value: object) -> str:
+    return ", ".join(f"{key} {one}" for key, one in value.items()) if isinstance(value, Mapping) else str(value)
+
+
+def plot(inspection: Inspection, file: Path) -> None:
+    """Write a PNG of the distributions of speed, gap and time on the street, per trait."""
+    figure = Figure(figsize=(12.0, 4.2), dpi=150, layout="constrained")
+    speed, gap, track = figure.subplots(1, 3)
+    for profile in DRIVER_PROFILES:
+        one = inspection.traits[profile.name]
+        _draw(speed, one.speed_mps, profile, width=0.02)
+        _draw(gap, one.gap_m, profile, width=0.1)
+        _draw(track, one.track_s, profile, width=0.5)
+    speed.set(xlabel="speed (m/s)", ylabel="steps")
+    gap.set(xlabel="gap to the leader, if there is one (m)", xlim=(0, None))
+    track.set(xlabel="time on the street (s)", ylabel="drivers", xlim=(0, None))
+    for axes in (speed, gap, track):
+        axes.set_ylim(0, None)
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        axes.grid(alpha=0.25)
+    manifest = inspection.manifest
+    figure.suptitle(
+        f"{manifest['windows']:,} windows, {sum(inspection.drivers_per_episode.count):,} episodes of traffic"
+    )
+    known = [
+        Patch(color=_rgb(one), alpha=0.5, label=f"{one.name} ({inspection.traits[one.name].drivers:,} drivers)")
+        for one in DRIVER_PROFILES
+    ]
+    figure.legend(handles=known, loc="outside lower center", ncols=len(known), frameon=False)
+    with whole_file(file) as partial:
+        figure.savefig(partial, format="png")
+
+
+def _draw(axes: Axes, distribution: Distribution, profile: DriverProfile, width: float) -> None:
+    """A histogram; its edges lie between the rounded values."""
+    if len(distribution.value) == 0:
+        return
+    first, last = (np.floor(end / width) for end in distribution.value[[0, -1]])
+    edges = np.arange(first, last + 2) * width - RESOLUTION / 2
+    share, _ = np.histogram(distribution.value, edges, weights=distribution.count / distribution.count.sum())
+    axes.stairs(share, edges, color=_rgb(profile), alpha=0.35, fill=True)
+    axes.stairs(share, edges, color=_rgb(profile))
+
+
+def _rgb(profile: DriverProfile) -> tuple[float, float, float]:
+    red, green, blue = (int(part) / 255 for part in profile.colour.split(","))
+    return red, green, blue

@@ -103,6 +103,29 @@ def test_time_runs_evenly_along_each_track(dataset: Path) -> None:
     np.testing.assert_allclose(steps, 0.1, atol=1e-4)
 
 
+def test_pandas_reads_a_folder_as_one_table(two_shards: Path) -> None:
+    manifest = json.loads((two_shards / MANIFEST).read_text())
+    rows = pd.read_parquet(two_shards / TRAJECTORIES)
+    assert len(rows) == manifest["rows"]
+    assert rows["episode"].unique().tolist() == list(range(manifest["episodes"]))
+    assert rows.set_index(["episode", "vehicle", "time_s"]).index.is_monotonic_increasing
+    assert rows.dtypes.astype(str).to_dict() == {
+        "episode": "int32",
+        "vehicle": "int16",
+        "time_s": "float32",
+        "lane": "category",
+        "direction": "int8",
+        "position_m": "float32",
+        "speed_mps": "float32",
+        "acceleration_mps2": "float32",
+        "leader": "Int16",
+        "gap_m": "float32",
+    }
+    one = pd.read_parquet(two_shards / TRAJECTORIES, columns=["gap_m"], filters=[("episode", "==", 17)])
+    assert len(one) == (rows["episode"] == 17).sum()
+    assert len(pd.read_parquet(two_shards / DRIVERS)) == manifest["drivers"]
+
+
 def test_columns_carry_their_units(dataset: Path) -> None:
     import pyarrow.parquet as pq
 

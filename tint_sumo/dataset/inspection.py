@@ -207,10 +207,8 @@ def plot(inspection: Inspection, file: Path) -> None:
         axes.set_ylim(0, None)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
         axes.grid(alpha=0.25)
-    manifest = inspection.manifest
-    figure.suptitle(
-        f"{manifest['windows']:,} windows, {sum(inspection.drivers_per_episode.count):,} episodes of traffic"
-    )
+    episodes = inspection.episode_s.count.sum()
+    figure.suptitle(f"{inspection.manifest['windows']:,} windows, {episodes:,} episodes of traffic")
     known = [
         Patch(color=_rgb(one), alpha=0.5, label=f"{one.name} ({inspection.traits[one.name].drivers:,} drivers)")
         for one in DRIVER_PROFILES

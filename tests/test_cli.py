@@ -16,7 +16,7 @@ import torch
 from tests.terminal import look, open_terminal
 from tint_sumo import traits
 from tint_sumo.cli import main
-from tint_sumo.config import VaeSettings
+from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.recorder import record
 from tint_sumo.study.methods import METHODS, Learned
 from tint_sumo.study.results import RESULTS
@@ -29,6 +29,8 @@ COMMANDS = (
     "dataset inspect",
     "traits train",
     "traits evaluate",
+    "traits plot",
+    "traits study",
     "policy train",
     "policy evaluate",
     "study run",
@@ -47,7 +49,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trait_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A trait model nobody trained."""
     torch.manual_seed(0)
-    settings = VaeSettings(embedding_sizes=(8, 8), hidden_size=8, encoder_output_size=8, decoder_output_size=8)
+    settings = TraitSettings(embedding_sizes=(8, 8), hidden_size=8, encoder_output_size=8, decoder_output_size=8)
     folder = tmp_path_factory.mktemp("model")
     save(traits.METHODS["ours"](settings), folder / "model", {"seed": 0})
     save(traits.METHODS["ours"](settings, latent_size=3), folder / "wide", {"seed": 0})
@@ -134,11 +136,13 @@ def test_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_traits(dataset: Path, tmp_path: Path, trait_model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    figure = tmp_path / "latent.png"
-    printed = run(capsys, "traits", "evaluate", "--data", dataset, "--model", trait_model, "--figure", figure)
+    printed = run(capsys, "traits", "evaluate", "--data", dataset, "--model", trait_model, "--noise", 0.1)
     assert 0.0 <= printed["accuracy"] <= 1.0
+    assert printed["noise_m"] == 0.1
     assert 0 < printed["windows"] < json.loads((dataset / "manifest.json").read_text())["windows"]
-    assert figure.read_bytes().startswith(b"\x89PNG")
+    printed = run(capsys, "traits", "plot", "--data", dataset, "--model", trait_model, "--out", tmp_path)
+    assert len(printed["files"]) == 2
+    assert all(Path(file).read_bytes().startswith(b"\x89PNG") for file in printed["files"])
 
 
 def test_policy_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
@@ -214,7 +218,9 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ("traits train --data NOWHERE --out OUT", "dataset"),
         ("traits train --data DATA --method magic --out OUT", "unknown trait method 'magic'"),
         ("traits train --data DATA --seed -1 --out OUT", "seed"),
+        ("traits train --data DATA --noise -0.1 --out OUT", "noise is a standard deviation"),
         ("traits evaluate --data NOWHERE --model MODEL", "dataset"),
+        ("traits evaluate --data DATA --model MODEL --noise nan", "noise is a standard deviation"),
         ("traits evaluate --data DATA --model nobody", "no trait model nobody"),
         ("policy train --method magic --out OUT", "unknown method 'magic'"),
         ("policy train --method ttc --out OUT", "hand-written rule"),

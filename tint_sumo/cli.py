@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 # ruff: noqa: PLC0415
 
 BudgetName = Literal["quick", "paper"]
+PopulationName = Literal["traits", "continuous"]
+TraitBudgetName = Literal["quick", "full", "paper"]
 
 RESUMES = ", the same command goes on from here"
 
@@ -71,6 +73,8 @@ class Record(Command):
     """At least so many windows of up to 20 steps of 0.1 s."""
     p_conservative: float = 0.5
     """Probability that a driver is conservative, 0 to 1."""
+    population: PopulationName = "traits"
+    """traits: conservative and aggressive drivers; continuous: desired speeds and gaps without classes."""
     seed: int = 0
     """Seed of the traffic."""
     workers: int = 1
@@ -85,6 +89,7 @@ class Record(Command):
             self.out,
             self.windows,
             p_conservative=self.p_conservative,
+            population=self.population,
             seed=self.seed,
             workers=self.workers,
             fcd=self.format == "fcd",
@@ -114,7 +119,7 @@ class InspectDataset(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainTraits(Command):
-    """Train a trait model on a dataset, without labels; the same command resumes an interrupted training."""
+    """Train a trait model on a dataset; the same command resumes an interrupted training."""
 
     after_interrupt: ClassVar[str] = RESUMES
 
@@ -123,19 +128,21 @@ class TrainTraits(Command):
     out: Path
     """Folder for the model."""
     method: str = "ours"
-    """Trait method; ours is the paper's."""
-    budget: BudgetName = "quick"
-    """Sizes of the network and of its training."""
+    """ours (the paper's), ours_plus and morton learn without labels, classifier with them."""
+    budget: TraitBudgetName = "quick"
+    """quick: for about 30,000 windows; full: for some 700,000; paper: the paper's network and 1000 epochs."""
+    noise: float = 0.0
+    """Standard deviation of the noise on every position in training, m."""
     seed: int = 0
     """Seed of the training, and of the split into training and test episodes."""
 
     def run(self) -> Outcome:
-        from tint_sumo.study.budgets import find_budget
-        from tint_sumo.study.trait_models import train_traits
+        from tint_sumo.study.budgets import TRAIT_BUDGETS
+        from tint_sumo.study.trait_models import require_noise, train_traits
 
-        card = train_traits(
-            self.data, self.out, method=self.method, settings=find_budget(self.budget).traits, seed=self.seed
-        )
+        require_noise(self.noise)
+        settings = replace(TRAIT_BUDGETS[self.budget], noise_m=self.noise)
+        card = train_traits(self.data, self.out, method=self.method, settings=settings, seed=self.seed)
         return Outcome(
             f"trained {self.method} on {card['windows']} windows: {self.out}", {**card, "out": str(self.out)}
         )
@@ -149,15 +156,66 @@ class EvaluateTraits(Command):
     """Folder of a dataset; the test episodes are those that training with the model's seed leaves out."""
     model: str
     """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
-    figure: Path | None = None
-    """Where a PNG of the latent space goes."""
+    noise: float = 0.0
+    """Standard deviation of the noise on every position, m."""
 
     def run(self) -> Outcome:
         from tint_sumo.study.trait_models import evaluate_traits
 
-        found = evaluate_traits(self.data, self.model, self.figure)
-        text = f"accuracy {found['accuracy']:.2%} on {found['windows']} windows"
-        return Outcome(text if self.figure is None else f"{text}\nwrote {self.figure}", found)
+        found = evaluate_traits(self.data, self.model, noise_m=self.noise)
+        parts = {**found["by_length"], **found["by_leader"]}
+        lines = [
+            f"linear SVC         {found['accuracy']:8.3%} of {found['windows']} windows",
+            f"nearest neighbours {found['knn_accuracy']:8.3%}",
+            *(f"  {_part_name(name):16} {part['accuracy']:8.3%}" for name, part in parts.items() if part["windows"]),
+        ]
+        if found["error_m"] is not None:
+            lines.append(f"position error     {found['error_m']:8.4f} m (root mean square)")
+        return Outcome("\n".join(lines), found)
+
+
+def _part_name(name: str) -> str:
+    return name.replace("_", " ") if name[0].isalpha() else f"{name} steps"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlotTraits(Command):
+    """Draw a model's latent space beside the trajectories of some windows, and reconstructions if it makes them."""
+
+    data: Path
+    """Folder of a dataset; the test episodes are those that training with the model's seed leaves out."""
+    model: str
+    """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
+    out: Path
+    """Folder for the PNG files."""
+    noise: float = 0.0
+    """Standard deviation of the noise on every position, m."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.trait_models import plot_traits
+
+        files = plot_traits(self.data, self.model, self.out, noise_m=self.noise)
+        return Outcome("\n".join(f"wrote {file}" for file in files), {"files": [str(file) for file in files]})
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyTraits(Command):
+    """Compare all trait methods at every position noise, hours of work; the same command resumes an interrupted one."""
+
+    after_interrupt: ClassVar[str] = RESUMES
+
+    out: Path = Path("runs/traits")
+    """Folder of the comparison."""
+    workers: int = 2
+    """Processes at a time."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.trait_study import TraitStudy, run_trait_study
+
+        report = run_trait_study(TraitStudy(), self.out, workers=self.workers)
+        files = [str(file) for file in (report.csv_file, report.markdown_file, report.figure_file)]
+        text = "\n".join([report.markdown, *(f"wrote {file}" for file in files)])
+        return Outcome(text, {"results": report.table.to_dict("records"), "files": files})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -293,7 +351,12 @@ class Dataset:
 class Traits:
     """Driver traits learnt from trajectories."""
 
-    command: Annotated[TrainTraits, subcommand("train")] | Annotated[EvaluateTraits, subcommand("evaluate")]
+    command: (
+        Annotated[TrainTraits, subcommand("train")]
+        | Annotated[EvaluateTraits, subcommand("evaluate")]
+        | Annotated[PlotTraits, subcommand("plot")]
+        | Annotated[StudyTraits, subcommand("study")]
+    )
 
 
 @dataclass(frozen=True)

@@ -48,16 +48,23 @@ class DriverProfile:
     """One driver trait."""
 
     name: str
-    desired_speed_mps: float  # paper IV-A
+    desired_speed_mps: tuple[float, float]  # uniform in this range (paper IV-A, where it is one speed)
     min_gap_m: tuple[float, float]  # uniform in this range (paper IV-A)
     entry_gap_m: tuple[float, float]  # bumper gap behind the leader at placement and entry, uniform (code)
     yields: bool  # whether the driver reacts to an ego that claims its lane (paper IV-A)
     colour: str  # of the vehicle in figures and in sumo-gui, "r,g,b"
 
+    @property
+    def rgb(self) -> tuple[float, float, float]:
+        """The colour's parts, each in [0, 1]."""
+        red, green, blue = (int(part) / 255 for part in self.colour.split(","))
+        return red, green, blue
 
-CONSERVATIVE = DriverProfile("conservative", 2.4, (0.5, 0.7), (4.0, 6.0), True, "40,90,200")
-AGGRESSIVE = DriverProfile("aggressive", 3.0, (0.3, 0.5), (3.0, 5.0), False, "200,40,40")
+
+CONSERVATIVE = DriverProfile("conservative", (2.4, 2.4), (0.5, 0.7), (4.0, 6.0), True, "40,90,200")
+AGGRESSIVE = DriverProfile("aggressive", (3.0, 3.0), (0.3, 0.5), (3.0, 5.0), False, "200,40,40")
 DRIVER_PROFILES = (CONSERVATIVE, AGGRESSIVE)
+CONTINUOUS = DriverProfile("continuous", (2.0, 3.4), (0.2, 0.8), (3.0, 6.0), True, "90,90,90")  # no classes at all
 
 
 @dataclass(frozen=True)
@@ -75,9 +82,13 @@ class Idm:
 class Population:
     """The vTypes drivers are drawn from."""
 
-    members: int = 32  # vTypes per profile, each with its own minGap
-    seed: int = 2022  # of the minGap draws
+    profiles: tuple[DriverProfile, ...] = DRIVER_PROFILES
+    members: int = 32  # vTypes per profile, each with its own draws
+    seed: int = 2022  # of the draws
     idm: Idm = Idm()
+
+
+POPULATIONS = {"traits": Population(), "continuous": Population((CONTINUOUS,), members=512)}
 
 
 @dataclass(frozen=True)
@@ -159,10 +170,10 @@ class Scenario:
 
 
 @dataclass(frozen=True)
-class VaeSettings:
-    """The paper's trait network and its training."""
+class TraitSettings:
+    """The paper's trait network and its training; every trait method takes what it needs of it."""
 
-    embedding_sizes: tuple[int, ...] = (32, 64)  # code
+    embedding_sizes: tuple[int, ...] = (32, 64)  # code; () feeds the features to the GRU as they are
     hidden_size: int = 256  # code
     encoder_output_size: int = 256  # code
     decoder_output_size: int = 128  # code
@@ -172,6 +183,7 @@ class VaeSettings:
     weight_decay: float = 1e-6  # code
     batch_size: int = 1024  # code
     epochs: int = 1000  # paper IV-B
+    noise_m: float = 0.0  # standard deviation of the noise on every position in training, drawn anew in each epoch
 
 
 @dataclass(frozen=True)

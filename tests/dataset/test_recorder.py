@@ -93,7 +93,7 @@ def test_the_tables_are_complete_and_sensible(dataset: Path) -> None:
     for profile in (CONSERVATIVE, AGGRESSIVE):
         mine = drivers[drivers["trait"] == profile.name]
         assert len(mine) > 200
-        assert mine["desired_speed_mps"].unique() == pytest.approx([profile.desired_speed_mps])
+        assert mine["desired_speed_mps"].unique() == pytest.approx([profile.desired_speed_mps[0]])
         assert mine["min_gap_m"].between(profile.min_gap_m[0] - 1e-6, profile.min_gap_m[1] + 1e-6).all()
 
 
@@ -184,3 +184,19 @@ def test_a_folder_of_another_run_is_left_alone(dataset: Path, tmp_path: Path) ->
     with pytest.raises(InputError, match="already holds other files"):
         record(tmp_path, WINDOWS)
     assert [file.name for file in tmp_path.iterdir()] == ["letters.txt"]
+
+
+def test_drivers_without_classes_are_recorded_by_the_same_command(tmp_path: Path) -> None:
+    manifest = record(tmp_path / "d", WINDOWS, population="continuous", progress=False)
+    drivers = pd.read_parquet(tmp_path / "d" / DRIVERS)
+    assert manifest["population"] == "continuous"
+    assert set(drivers["trait"]) == {"continuous"}
+    assert drivers["desired_speed_mps"].between(2.0, 3.4).all()
+    assert drivers["desired_speed_mps"].nunique() > 100
+    rows = pd.read_parquet(tmp_path / "d" / TRAJECTORIES)
+    fastest = rows.groupby(["episode", "vehicle"])["speed_mps"].max()
+    wanted = drivers.set_index(["episode", "vehicle"])["desired_speed_mps"]
+    assert (fastest <= wanted.loc[fastest.index] + 1e-4).all()
+    assert np.corrcoef(fastest, wanted.loc[fastest.index])[0, 1] > 0.5
+    with pytest.raises(InputError, match="unknown population 'odd'"):
+        record(tmp_path / "e", WINDOWS, population="odd")

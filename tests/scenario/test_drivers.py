@@ -1,9 +1,11 @@
 from collections import Counter
 from dataclasses import replace
+from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Population, VehicleShape
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, POPULATIONS, Population, VehicleShape
 from tint_sumo.scenario.drivers import members, vtypes_xml
 
 
@@ -32,3 +34,17 @@ def test_distribution_has_the_probability_of_conservative_drivers() -> None:
     weights = [float(weight) for weight in line.split('"')[1].split()]
     assert sum(weights[:4]) == pytest.approx(0.25)
     assert sum(weights) == pytest.approx(1.0)
+
+
+def test_a_continuous_population_has_independent_speeds_and_gaps() -> None:
+    population = POPULATIONS["continuous"]
+    drivers = members(population)
+    speed_mps = np.array([driver.desired_speed_mps for driver in drivers])
+    min_gap_m = np.array([driver.min_gap_m for driver in drivers])
+    assert len(drivers) == 512
+    assert 2.0 <= speed_mps.min() < 2.05 and 3.35 < speed_mps.max() <= 3.4
+    assert 0.2 <= min_gap_m.min() < 0.22 and 0.78 < min_gap_m.max() <= 0.8
+    assert abs(np.corrcoef(speed_mps, min_gap_m)[0, 1]) < 0.1
+    xml = vtypes_xml(population, 0.3, VehicleShape())
+    probabilities = ElementTree.fromstring(xml).find("vTypeDistribution").attrib["probabilities"].split()
+    assert sum(map(float, probabilities)) == pytest.approx(1.0, rel=1e-3)

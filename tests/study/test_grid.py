@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from tint_sumo.config import PpoSettings, VaeSettings
+from tint_sumo.config import PpoSettings, TraitSettings
 from tint_sumo.errors import InputError
 from tint_sumo.study.budgets import BUDGETS, Budget, find_budget
 from tint_sumo.study.grid import plan, run_study
@@ -14,7 +14,7 @@ from tint_sumo.study.trait_job import TraitJob
 
 @pytest.fixture(scope="module")
 def budget() -> Budget:
-    network = VaeSettings(
+    network = TraitSettings(
         embedding_sizes=(8, 8), hidden_size=8, encoder_output_size=8, decoder_output_size=8, batch_size=64, epochs=1
     )
     return Budget(
@@ -102,7 +102,7 @@ def test_budgets(name: str) -> None:
 def test_the_paper_s_budget() -> None:
     paper = BUDGETS["paper"]
     assert paper.ppo == PpoSettings()
-    assert paper.traits == VaeSettings()
+    assert paper.traits == TraitSettings()
     assert (paper.p_conservative, len(paper.seeds), paper.episodes) == ((0.25, 0.4, 0.6), 3, 500)
 
 

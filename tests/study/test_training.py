@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tint_sumo import traits
-from tint_sumo.config import PpoSettings, VaeSettings
+from tint_sumo.config import PpoSettings, TraitSettings
 from tint_sumo.errors import InputError
 from tint_sumo.policy import EncoderTraits, RecurrentPPO
 from tint_sumo.study.evaluation import CASE_SEED, evaluate
@@ -16,7 +16,7 @@ from tint_sumo.study.loading import load_policy
 from tint_sumo.study.training import CHECKPOINT_FILE, train_policy
 from tint_sumo.traits.storage import save
 
-SMALL_VAE = VaeSettings(embedding_sizes=(4, 4), hidden_size=4, encoder_output_size=4, decoder_output_size=4)
+SMALL_VAE = TraitSettings(embedding_sizes=(4, 4), hidden_size=4, encoder_output_size=4, decoder_output_size=4)
 
 
 @pytest.fixture

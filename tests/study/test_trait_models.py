@@ -4,15 +4,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tint_sumo.config import VaeSettings
+from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_labels, load_windows, split_by_episode
 from tint_sumo.errors import InputError
 from tint_sumo.study import trait_models
-from tint_sumo.study.trait_models import evaluate_traits, train_traits
+from tint_sumo.study.trait_models import evaluate_traits, plot_traits, train_traits
+from tint_sumo.traits import METHODS
 from tint_sumo.traits.evaluation import TEST_FRACTION
 
-SMALL = VaeSettings(
+SMALL = TraitSettings(
     embedding_sizes=(8, 8), hidden_size=8, encoder_output_size=8, decoder_output_size=8, batch_size=64, epochs=1
 )
 SEED = 3
@@ -21,7 +22,7 @@ SEED = 3
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data") / "dataset"
-    record(folder, 100, workers=2, progress=False)  # in other processes: this one's libsumo stays free
+    record(folder, 100, seed=5, workers=2, progress=False)  # in other processes: this one's libsumo stays free
     return folder
 
 
@@ -48,21 +49,46 @@ def test_training_sees_the_training_episodes_only(
     _, test = split_by_episode(windows, TEST_FRACTION, SEED)
     assert set(seen[0].episode).isdisjoint(windows.episode[test])
     assert card["windows"] == len(seen[0]) == len(windows) - len(test)
-    assert card["data"] == {"p_conservative": 0.5, "seed": 0, "windows": len(windows)}
+    assert card["data"] == {"p_conservative": 0.5, "population": "traits", "seed": 5, "windows": len(windows)}
 
 
-def test_evaluation_takes_the_episodes_left_out_by_the_model_s_seed(
+def test_evaluation_and_pictures_take_the_episodes_left_out_by_the_model_s_seed(
     dataset: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[np.ndarray] = []
-    monkeypatch.setattr(trait_models, "plot_latents", lambda _, windows, labels, file: drawn.append(windows.episode))
-    found = evaluate_traits(dataset, model, tmp_path / "latent.png")
+    original = trait_models.plot_latents
+
+    def plot(model: Any, windows: Windows, *args: Any, **kwargs: Any) -> None:
+        drawn.append(windows.episode)
+        original(model, windows, *args, **kwargs)
+
+    monkeypatch.setattr(trait_models, "plot_latents", plot)
+    files = plot_traits(dataset, model, tmp_path)
+    assert [file.name for file in files] == ["latent.png", "reconstruction.png"]
+    assert all(file.exists() for file in files)
+    found = evaluate_traits(dataset, model)
     windows = load_windows(dataset)
     _, test = split_by_episode(windows, TEST_FRACTION, SEED)
     assert found["windows"] == len(test)
     np.testing.assert_array_equal(drawn[0], windows.episode[test])
     labels = load_labels(dataset, windows)[test]
     assert max(labels.mean(), 1 - labels.mean()) - 0.05 <= found["accuracy"] <= 1.0
+
+
+def test_noise_makes_evaluation_harder_and_is_repeatable(dataset: Path) -> None:
+    clean, noisy, again = (evaluate_traits(dataset, "ours", noise_m=noise_m) for noise_m in (0.0, 0.3, 0.3))
+    assert noisy == again
+    assert noisy["accuracy"] < clean["accuracy"] - 0.1
+    with pytest.raises(InputError, match="0 or more, not -1"):
+        evaluate_traits(dataset, "ours", noise_m=-1.0)
+
+
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_every_method_trains_on_a_dataset_and_reports_its_errors(dataset: Path, tmp_path: Path, method: str) -> None:
+    train_traits(dataset, tmp_path, method=method, settings=SMALL, seed=SEED, progress=False)
+    found = evaluate_traits(dataset, tmp_path)
+    assert 0.4 < found["accuracy"] <= 1.0
+    assert (found["error_m"] is None) == (method == "classifier")
 
 
 def test_a_negative_seed_is_refused(dataset: Path, tmp_path: Path) -> None:

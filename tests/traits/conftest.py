@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, WINDOW_STEPS, DriverProfile, EpisodeRules, Idm, VaeSettings
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, WINDOW_STEPS, DriverProfile, EpisodeRules, Idm, TraitSettings
 from tint_sumo.dataset.schema import NO_LEADER_GAP_M
 from tint_sumo.dataset.windows import Windows
 
@@ -29,7 +29,7 @@ class Platoons:
         entry_gap = _draw(conservative, generator, lambda profile: profile.entry_gap_m)
         return cls(
             conservative,
-            _draw(conservative, generator, lambda profile: (profile.desired_speed_mps,) * 2),
+            _draw(conservative, generator, lambda profile: profile.desired_speed_mps),
             _draw(conservative, generator, lambda profile: profile.min_gap_m),
             STREET_M - np.cumsum(entry_gap + VEHICLE_LENGTH_M, axis=1) + VEHICLE_LENGTH_M,
         )
@@ -103,9 +103,9 @@ def street() -> tuple[Windows, NDArray[np.bool_]]:
 
 
 @pytest.fixture(scope="session")
-def small() -> VaeSettings:
+def small() -> TraitSettings:
     """A network and a schedule of a moment."""
-    return VaeSettings(
+    return TraitSettings(
         embedding_sizes=(8, 8),
         hidden_size=8,
         encoder_output_size=8,

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from tint_sumo.config import VaeSettings
+from tint_sumo.config import TraitSettings
 from tint_sumo.errors import InputError
 from tint_sumo.traits import METHODS
 from tint_sumo.traits.model import FEATURE_SPREAD, find_method, register
@@ -10,7 +10,7 @@ from tint_sumo.traits.vae import Vae
 
 @pytest.fixture
 def model() -> Vae:
-    return Vae(VaeSettings())
+    return Vae(TraitSettings())
 
 
 @pytest.fixture
@@ -27,9 +27,10 @@ LENGTH = torch.tensor([5, 3])
 def test_features_of_the_training_data_are_centred_and_scaled_over_valid_steps(model, states):
     model.fit_features(states, LENGTH)
     features = model.features(states, LENGTH)
-    moving = torch.cat((features[0, 1:], features[1, 1:3]))
-    assert moving.mean(dim=0).numpy() == pytest.approx([0.0, 0.0], abs=1e-5)
-    assert moving.std(dim=0, correction=0).numpy() == pytest.approx(FEATURE_SPREAD, abs=1e-5)
+    known = (torch.cat((features[0, 1:, 0], features[1, 1:3, 0])), torch.cat((features[0, :, 1], features[1, :3, 1])))
+    for values, spread in zip(known, FEATURE_SPREAD, strict=True):
+        assert float(values.mean()) == pytest.approx(0.0, abs=1e-5)
+        assert float(values.std(correction=0)) == pytest.approx(spread, abs=1e-5)
 
 
 def test_features_can_be_turned_back_into_offset_and_gap(model, states):

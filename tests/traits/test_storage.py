@@ -108,7 +108,7 @@ def test_a_card_that_does_not_fit_the_weights_is_reported(saved, small):
         load(saved)
 
 
-@pytest.mark.parametrize("settings", [{"depth": 3}, {"embedding_sizes": []}, {"hidden_size": "many"}])
+@pytest.mark.parametrize("settings", [{"depth": 3}, {"embedding_sizes": [-1]}, {"hidden_size": "many"}])
 def test_settings_nobody_can_use_are_reported(saved, settings):
     add_directly(saved, {"settings": settings})
     with pytest.raises(InputError, match="unusable settings"):

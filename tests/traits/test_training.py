@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import torch
 
-from tint_sumo.dataset.windows import Windows
 from tint_sumo.errors import InputError
-from tint_sumo.traits import load, training
+from tint_sumo.traits import METHODS, load, training
 from tint_sumo.traits.evaluation import evaluate
 from tint_sumo.traits.training import CHECKPOINT_FILE, train
 from tint_sumo.traits.vae import Vae
+
+from .scenes import two_populations
 
 
 @pytest.fixture
@@ -80,7 +81,7 @@ def test_the_seed_decides_the_result_and_the_global_generator_is_left_alone(wind
     assert torch.equal(torch.rand(1), expected)
     assert_same_weights(train(windows, small, tmp_path / "b", seed=7, progress=False), first)
     other = train(windows, small, tmp_path / "c", seed=8, progress=False)
-    assert not torch.equal(other.mean_head.weight, first.mean_head.weight)
+    assert not torch.equal(other.encoder.mean_head.weight, first.encoder.mean_head.weight)
 
 
 @pytest.mark.parametrize("change", ["seed", "settings", "windows"])
@@ -127,24 +128,36 @@ def test_large_networks_train_in_bfloat16(windows, small, tmp_path):
     assert all(value.dtype == torch.float32 and value.isfinite().all() for value in model.state_dict().values())
 
 
-def two_populations(drivers):
-    """Drivers at about 2.4 and 3.0 m/s behind leaders at any distance, and who is of the slow ones."""
-    generator = np.random.default_rng(2)
-    slow = generator.random(drivers) < 0.5
-    speed_mps = np.where(slow, 2.4, 3.0) + generator.normal(scale=0.05, size=drivers)
-    offset = speed_mps[:, None] * 0.1 * np.arange(20)
-    gap = np.broadcast_to(generator.uniform(3.0, 12.0, size=(drivers, 1)), offset.shape)
-    windows = Windows(
-        states=np.stack((offset, gap), axis=2).astype(np.float32),
-        length=np.full(drivers, 20),
-        driver=np.arange(drivers),
-        episode=np.arange(drivers) // 10,
-        has_leader=np.ones(drivers, dtype=bool),
-    )
-    return windows, slow
-
-
-def test_two_populations_separate_without_labels(small, tmp_path):
+@pytest.mark.parametrize("method", ["classifier", "ours", "ours_plus"])  # at constant speed morton has nothing to learn
+def test_two_populations_separate(small, tmp_path, method):
     windows, slow = two_populations(1000)
-    model = train(windows, replace(small, hidden_size=16, learning_rate=1e-2, epochs=8), tmp_path, progress=False)
+    labels = slow if METHODS[method].uses_labels else None
+    settings = replace(small, hidden_size=16, learning_rate=1e-2, epochs=8)
+    model = train(windows, settings, tmp_path, method=method, conservative=labels, progress=False)
     assert evaluate(model, windows, slow).accuracy > 0.95
+
+
+def test_only_the_classifier_gets_labels(windows, small, tmp_path):
+    assert [name for name, method in METHODS.items() if method.uses_labels] == ["classifier"]
+    for method in METHODS:
+        labels = None if METHODS[method].uses_labels else np.ones(len(windows), bool)
+        with pytest.raises(ValueError, match="labels are for the methods that learn with them"):
+            train(windows, small, tmp_path / method, method=method, conservative=labels, progress=False)
+
+
+def test_noise_is_drawn_anew_in_every_epoch_from_the_seed(windows, small, tmp_path, monkeypatch):
+    seen = []
+    original = Vae.loss
+
+    def loss(self, batch, generator):
+        seen.append(batch.states.sum().item())
+        return original(self, batch, generator)
+
+    monkeypatch.setattr(Vae, "loss", loss)
+    one_batch = replace(small, batch_size=len(windows), epochs=2, noise_m=0.1)
+    first = train(windows, one_batch, tmp_path / "first", progress=False)
+    assert seen[0] != pytest.approx(seen[1], abs=1e-3)
+    again = train(windows, one_batch, tmp_path / "again", progress=False)
+    assert_same_weights(first, again)
+    clean = train(windows, replace(one_batch, noise_m=0.0), tmp_path / "clean", progress=False)
+    assert clean.feature_scale[0] < first.feature_scale[0]

@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from tint_sumo.config import DRIVER_PROFILES, DriverProfile
+from tint_sumo.config import POPULATIONS, DriverProfile
 from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, read_shard, shard_file
 from tint_sumo.dataset.windows import read_manifest
 from tint_sumo.errors import InputError
@@ -125,7 +125,7 @@ def inspect(folder: Path, progress: bool = True) -> Inspection:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
     """
     manifest = read_manifest(folder)
-    traits = {profile.name: TraitStatistics() for profile in DRIVER_PROFILES}
+    traits = {profile.name: TraitStatistics() for profile in _profiles(manifest)}
     episode_s = drivers_per_episode = NOTHING
     for rows in _shards(folder, manifest, progress):
         for trait in traits:
@@ -140,6 +140,10 @@ def inspect(folder: Path, progress: bool = True) -> Inspection:
             "repeat the command that recorded the dataset"
         )
     return Inspection(manifest, traits, episode_s, drivers_per_episode)
+
+
+def _profiles(manifest: Mapping[str, Any]) -> tuple[DriverProfile, ...]:
+    return POPULATIONS[manifest["population"]].profiles
 
 
 def _shards(folder: Path, manifest: Mapping[str, Any], progress: bool) -> Iterator[pd.DataFrame]:
@@ -195,7 +199,8 @@ def plot(inspection: Inspection, file: Path) -> None:
     """Write a PNG of the distributions of speed, gap and time on the street, per trait."""
     figure = Figure(figsize=(12.0, 4.2), dpi=150, layout="constrained")
     speed, gap, track = figure.subplots(1, 3)
-    for profile in DRIVER_PROFILES:
+    profiles = _profiles(inspection.manifest)
+    for profile in profiles:
         one = inspection.traits[profile.name]
         _draw(speed, one.speed_mps, profile, width=0.02)
         _draw(gap, one.gap_m, profile, width=0.1)
@@ -210,8 +215,8 @@ def plot(inspection: Inspection, file: Path) -> None:
     episodes = inspection.episode_s.count.sum()
     figure.suptitle(f"{inspection.manifest['windows']:,} windows, {episodes:,} episodes of traffic")
     known = [
-        Patch(color=_rgb(one), alpha=0.5, label=f"{one.name} ({inspection.traits[one.name].drivers:,} drivers)")
-        for one in DRIVER_PROFILES
+        Patch(color=one.rgb, alpha=0.5, label=f"{one.name} ({inspection.traits[one.name].drivers:,} drivers)")
+        for one in profiles
     ]
     figure.legend(handles=known, loc="outside lower center", ncols=len(known), frameon=False)
     with whole_file(file) as partial:
@@ -225,10 +230,5 @@ def _draw(axes: Axes, distribution: Distribution, profile: DriverProfile, width:
     first, last = (np.floor(end / width) for end in distribution.value[[0, -1]])
     edges = np.arange(first, last + 2) * width - RESOLUTION / 2
     share, _ = np.histogram(distribution.value, edges, weights=distribution.count / distribution.count.sum())
-    axes.stairs(share, edges, color=_rgb(profile), alpha=0.35, fill=True)
-    axes.stairs(share, edges, color=_rgb(profile))
-
-
-def _rgb(profile: DriverProfile) -> tuple[float, float, float]:
-    red, green, blue = (int(part) / 255 for part in profile.colour.split(","))
-    return red, green, blue
+    axes.stairs(share, edges, color=profile.rgb, alpha=0.35, fill=True)
+    axes.stairs(share, edges, color=profile.rgb)

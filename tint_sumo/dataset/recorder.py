@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from tint_sumo.config import MAX_VEHICLES, WINDOW_STEPS, Scenario, Traffic
+from tint_sumo.config import MAX_VEHICLES, POPULATIONS, WINDOW_STEPS, Scenario, Traffic
 from tint_sumo.dataset.fcd import write_fcd
 from tint_sumo.dataset.schema import (
     DRIVER_SCHEMA,
@@ -64,6 +64,7 @@ class Recording:
 
     windows: int
     p_conservative: float = 0.5
+    population: str = "traits"  # a name in POPULATIONS
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -71,10 +72,12 @@ class Recording:
             raise InputError(f"windows must be at least 1, not {self.windows}")
         if self.seed < 0:
             raise InputError(f"seed must not be negative: {self.seed}")
+        if self.population not in POPULATIONS:
+            raise InputError(f"unknown population {self.population!r}; choose one of: {', '.join(POPULATIONS)}")
         self.scenario()
 
     def scenario(self) -> Scenario:
-        return Scenario(traffic=Traffic(p_conservative=self.p_conservative))
+        return Scenario(Traffic(p_conservative=self.p_conservative), POPULATIONS[self.population])
 
     def settings(self) -> dict[str, Any]:
         return {
@@ -82,6 +85,7 @@ class Recording:
             "schema_version": SCHEMA_VERSION,
             "windows": self.windows,
             "p_conservative": self.p_conservative,
+            "population": self.population,
             "seed": self.seed,
         }
 
@@ -91,6 +95,7 @@ def record(
     windows: int,
     *,
     p_conservative: float = 0.5,
+    population: str = "traits",
     seed: int = 0,
     workers: int = 1,
     fcd: bool = False,
@@ -104,7 +109,7 @@ def record(
     Raises:
         InputError: bad values, or ``out`` holds another run.
     """
-    recording = Recording(windows, p_conservative, seed)
+    recording = Recording(windows, p_conservative, population, seed)
     if workers < 1:
         raise InputError(f"workers must be at least 1, not {workers}")
     with claim_folder(out, recording.settings()):
@@ -212,7 +217,7 @@ def _record_shard(recording: Recording, out: Path, fcd: bool, shard: int) -> int
 
 def _record_tables(recording: Recording, out: Path, shard: int) -> None:
     trajectories, drivers = simulate_episodes(
-        _simulation(recording.p_conservative), recording.seed, first_episode=shard * EPISODES_PER_SHARD
+        _simulation(recording.scenario()), recording.seed, first_episode=shard * EPISODES_PER_SHARD
     )
     windows = str(count_windows(trajectories)).encode()
     # The trajectories come last: where they are, the shard's tables are complete.
@@ -221,9 +226,8 @@ def _record_tables(recording: Recording, out: Path, shard: int) -> None:
 
 
 @cache
-def _simulation(p_conservative: float) -> Intersections:
+def _simulation(scenario: Scenario) -> Intersections:
     """This process's simulation; starting one for every shard would cost more than recording it."""
-    scenario = Scenario(traffic=Traffic(p_conservative=p_conservative))
     return Intersections(EPISODES_PER_SHARD, scenario, with_ego=False)
 
 

@@ -1,5 +1,6 @@
 """Windows of up to 20 steps for learning traits, from a recorded dataset. Labels are loaded apart."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Self
@@ -76,17 +77,25 @@ def cut_windows(
 
 
 def load_labels(folder: Path, windows: Windows) -> NDArray[np.bool_]:
-    """Whether each window's driver is conservative; (N,). The only way to the label, for evaluation alone.
+    """Whether each window's driver is conservative; (N,). Never an input of a method without labels.
 
     Raises:
         InputError: the labels are missing or do not belong to these windows.
     """
-    rows = _read(folder, DRIVERS, ["episode", "vehicle", "trait"], read_manifest(folder)["drivers"])
-    known = _driver_numbers(rows)
-    row = pd.Index(known).get_indexer(pd.Index(windows.driver))
+    return np.asarray(load_drivers(folder, windows, ["trait"])["trait"] == "conservative", bool)
+
+
+def load_drivers(folder: Path, windows: Windows, columns: Sequence[str]) -> pd.DataFrame:
+    """Columns of the label file, such as ``desired_speed_mps``, a row for each window's driver.
+
+    Raises:
+        InputError: the labels are missing or do not belong to these windows.
+    """
+    rows = _read(folder, DRIVERS, ["episode", "vehicle", *columns], read_manifest(folder)["drivers"])
+    row = pd.Index(_driver_numbers(rows)).get_indexer(pd.Index(windows.driver))
     if (row < 0).any():
         raise InputError(f"{folder / DRIVERS} lacks drivers of these windows; record the dataset anew")
-    return np.asarray(rows["trait"] == "conservative", bool)[row]
+    return rows[list(columns)].iloc[row].reset_index(drop=True)
 
 
 def split_by_episode(windows: Windows, test_fraction: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -110,7 +119,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise InputError(
             f"{folder} has dataset schema version {found}, this tint_sumo reads {SCHEMA_VERSION}; record it anew"
         )
-    missing = [key for key in ("rows", "drivers", "windows", "seed", "p_conservative") if key not in manifest]
+    missing = [
+        key for key in ("rows", "drivers", "windows", "seed", "p_conservative", "population") if key not in manifest
+    ]
     if missing:
         raise InputError(f"{folder / MANIFEST} is damaged (no {', '.join(missing)}); record the dataset anew")
     return manifest

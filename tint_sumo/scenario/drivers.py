@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tint_sumo.config import DRIVER_PROFILES, DriverProfile, Idm, Population, VehicleShape
+from tint_sumo.config import DriverProfile, Idm, Population, VehicleShape
 
 DISTRIBUTION_ID = "drivers"
 EGO_TYPE = "ego"
@@ -26,16 +26,16 @@ class DriverMember:
 
 def members(population: Population) -> tuple[DriverMember, ...]:
     """All vTypes of a population, profile by profile, ``population.members`` each."""
-    rng = np.random.default_rng(population.seed)
+    gaps, speeds = (np.random.default_rng(seed) for seed in (population.seed, (population.seed, 1)))
     return tuple(
         DriverMember(
             type_id=f"{profile.name}.{index}",
             profile=profile,
-            desired_speed_mps=profile.desired_speed_mps,
-            min_gap_m=round(float(rng.uniform(*profile.min_gap_m)), 4),
+            desired_speed_mps=round(float(speeds.uniform(*profile.desired_speed_mps)), 4),
+            min_gap_m=round(float(gaps.uniform(*profile.min_gap_m)), 4),
             idm=population.idm,
         )
-        for profile in DRIVER_PROFILES
+        for profile in population.profiles
         for index in range(population.members)
     )
 
@@ -43,7 +43,8 @@ def members(population: Population) -> tuple[DriverMember, ...]:
 def vtypes_xml(population: Population, p_conservative: float, vehicle: VehicleShape) -> str:
     """SUMO additional file with every vType, the distribution with P(conservative) and the ego's type."""
     drivers = members(population)
-    weight = {True: p_conservative, False: 1.0 - p_conservative}
+    mixed = len({member.profile.yields for member in drivers}) == 2
+    weight = {True: p_conservative, False: 1.0 - p_conservative} if mixed else {True: 1.0, False: 1.0}
     probabilities = [weight[member.profile.yields] / population.members for member in drivers]
     # SUMO cuts the corners off a passenger car's shape before it looks for collisions; a van keeps its full box.
     shape = f'guiShape="delivery" length="{vehicle.length_m:g}" width="{vehicle.width_m:g}"'

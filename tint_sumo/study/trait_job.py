@@ -5,11 +5,11 @@ from pathlib import Path
 
 import torch
 
-from tint_sumo.config import VaeSettings
+from tint_sumo.config import TraitSettings
 from tint_sumo.files import write_json
 from tint_sumo.study.pool import THREADS_PER_JOB
 from tint_sumo.study.progress import Report
-from tint_sumo.study.trait_models import evaluate_traits, train_traits
+from tint_sumo.study.trait_models import evaluate_traits, plot_traits, train_traits
 from tint_sumo.traits.storage import add_to_card
 
 DATASET = "dataset"  # folder of the dataset in a study's folder
@@ -21,7 +21,7 @@ class TraitJob:
     """Train a trait model on the study's dataset and see how well it tells the traits apart."""
 
     method: str
-    settings: VaeSettings
+    settings: TraitSettings
     out: Path  # of the study
 
     @property
@@ -44,7 +44,8 @@ class TraitJob:
         report(0, 1, "training")
         data = self.out / DATASET
         train_traits(data, self.folder, method=self.method, settings=self.settings, seed=SEED, progress=False)
-        found = evaluate_traits(data, self.folder, figure=self.folder / "latent.png")
+        found = evaluate_traits(data, self.folder)
+        plot_traits(data, self.folder, self.folder)
         add_to_card(self.folder / "model.safetensors", {"accuracy": found["accuracy"]})
         write_json(self.folder / "evaluation.json", found)
         return f"{found['accuracy']:.1%} of {found['windows']} unseen windows told apart"

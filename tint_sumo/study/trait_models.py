@@ -4,19 +4,25 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tint_sumo import traits
-from tint_sumo.config import VaeSettings
-from tint_sumo.dataset.windows import load_labels, load_windows, read_manifest, split_by_episode
+from tint_sumo.config import TraitSettings
+from tint_sumo.dataset.windows import Windows, load_labels, load_windows, read_manifest, split_by_episode
 from tint_sumo.errors import InputError
-from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate, plot_latents
+from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
+from tint_sumo.traits.figures import plot_latents, plot_reconstructions
+from tint_sumo.traits.model import find_method
 from tint_sumo.traits.storage import read_card
 from tint_sumo.traits.training import train
+from tint_sumo.traits.vae import Vae
 
 
 def train_traits(
-    data: Path, out: Path, *, method: str = "ours", settings: VaeSettings, seed: int = 0, progress: bool = True
+    data: Path, out: Path, *, method: str = "ours", settings: TraitSettings, seed: int = 0, progress: bool = True
 ) -> dict[str, Any]:
-    """Train a trait model on two thirds of a dataset's episodes (paper IV-B), without labels, and return its card.
+    """Train a trait model on two thirds of a dataset's episodes (paper IV-B) and return its card.
 
     Args:
         data: folder of a dataset.
@@ -33,40 +39,68 @@ def train_traits(
         raise InputError(f"seed must not be negative: {seed}")
     windows = load_windows(data)
     chosen, _ = split_by_episode(windows, TEST_FRACTION, seed)
-    card = {"data": _described(data)}
-    train(windows[chosen], settings, out, method=method, seed=seed, progress=progress, card=card)
+    labels = load_labels(data, windows)[chosen] if find_method(method).uses_labels else None
+    card = {"data": describe(data)}
+    train(windows[chosen], settings, out, method=method, seed=seed, conservative=labels, progress=progress, card=card)
     return read_card(out / "model.safetensors")
 
 
-def evaluate_traits(data: Path, model: str | Path, figure: Path | None = None) -> dict[str, Any]:
-    """Accuracy of a linear classifier on a model's latents, in the episodes that its training left out.
+def evaluate_traits(data: Path, model: str | Path, *, noise_m: float = 0.0) -> dict[str, Any]:
+    """Accuracy of classifiers on a model's latents, in the episodes that its training left out.
 
     Args:
         data: folder of a dataset.
         model: name of a shipped model, folder of a training run, or path of a .safetensors file.
-        figure: where a picture of the latent space goes; None for no picture.
+        noise_m: standard deviation of the noise on every position.
 
     Returns:
-        ``accuracy`` and ``windows`` (those of the test episodes), ``by_length`` and ``by_leader``.
+        ``model``, ``noise_m`` and the fields of ``TraitAccuracy``.
 
     Raises:
         InputError: no usable dataset or model.
     """
+    trained, windows, labels, seed = _load_for_test(data, model, noise_m)
+    found = evaluate(trained, windows, labels, noise_m=noise_m, seed=seed)
+    return {"model": str(model), "noise_m": noise_m, **asdict(found)}
+
+
+def plot_traits(data: Path, model: str | Path, out: Path, *, noise_m: float = 0.0) -> list[Path]:
+    """Write pictures of what a model makes of unseen episodes into the folder ``out``; the files written.
+
+    Raises:
+        InputError: no usable dataset or model.
+    """
+    trained, windows, labels, seed = _load_for_test(data, model, noise_m)
+    _, unseen = split_by_episode(windows, TEST_FRACTION, seed)
+    files = [out / "latent.png"]
+    plot_latents(trained, windows[unseen], labels[unseen], files[0], noise_m=noise_m)
+    if isinstance(trained, Vae):
+        files.append(out / "reconstruction.png")
+        plot_reconstructions(trained, windows[unseen], files[1])
+    return files
+
+
+def _load_for_test(
+    data: Path, model: str | Path, noise_m: float
+) -> tuple[traits.TraitModel, Windows, NDArray[np.bool_], int]:
+    """A model, a dataset it may be tested on, its labels, and the seed of the split into training and test."""
+    require_noise(noise_m)
     trained = traits.load(model)
     _require_unseen(data, model)
     windows = load_windows(data)
-    labels = load_labels(data, windows)
-    seed = int(read_card(model).get("seed", 0))
-    found = evaluate(trained, windows, labels, seed=seed)
-    if figure is not None:
-        _, unseen = split_by_episode(windows, TEST_FRACTION, seed)
-        plot_latents(trained, windows[unseen], labels[unseen], figure)
-    return {"model": str(model), **asdict(found)}
+    return trained, windows, load_labels(data, windows), int(read_card(model).get("seed", 0))
 
 
-def _described(data: Path) -> dict[str, Any]:
+def require_noise(noise_m: float) -> None:
+    """Raise InputError unless ``noise_m`` can be a standard deviation."""
+    if not 0.0 <= noise_m < float("inf"):
+        raise InputError(f"noise is a standard deviation in m and must be 0 or more, not {noise_m}")
+
+
+def describe(data: Path) -> dict[str, Any]:
+    """What a model's card says about the dataset it was trained on."""
     manifest = read_manifest(data)
-    return {key: manifest[key] for key in ("p_conservative", "seed", "windows")}
+    return {key: manifest[key] for key in ("p_conservative", "population", "seed", "windows")}
 
 
 def _require_unseen(data: Path, model: str | Path) -> None:
@@ -75,8 +109,8 @@ def _require_unseen(data: Path, model: str | Path) -> None:
     Episodes follow from P and seed; a dataset of another size has them in common, but splits them otherwise.
     """
     trained_on = read_card(model).get("data") or {}
-    here = _described(data)
-    alike = all(trained_on.get(key) == here[key] for key in ("p_conservative", "seed"))
+    here = describe(data)
+    alike = all(trained_on.get(key) == here[key] for key in ("p_conservative", "population", "seed"))
     if alike and trained_on["windows"] != here["windows"]:
         raise InputError(
             f"{data} has episodes that {model} was trained on; record another dataset with --seed {here['seed'] + 1}"

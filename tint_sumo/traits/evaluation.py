@@ -1,27 +1,27 @@
-"""How well traits can be read from a model's latents: labels are used here and nowhere else on this floor."""
+"""How well traits can be read from a model's latents: with labels, which label-free methods meet nowhere else."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from sklearn.pipeline import make_pipeline
+from sklearn.linear_model import LinearRegression
+from sklearn.neighbors import KNeighborsClassifier
+from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DriverProfile
 from tint_sumo.dataset.windows import Windows, split_by_episode
 from tint_sumo.errors import InputError
-from tint_sumo.files import whole_file
+from tint_sumo.traits.batches import TrainingWindows
 from tint_sumo.traits.model import TraitModel
 
 TEST_FRACTION = 1 / 3  # paper IV-B
 LENGTH_BINS = ((2, 5), (6, 10), (11, 19), (20, 20))
-ENCODING_BATCH = 4096
-DRAWN_WINDOWS = 5000  # more would hide each other
+NEIGHBOURS = 15
+KNN_REFERENCES = 50_000  # windows; more cost time and change nothing
+ENCODING_BATCH = 1024  # keeps a step of the network in the processor's cache
 
 
 @dataclass(frozen=True)
@@ -34,86 +34,169 @@ class Part:
 
 @dataclass(frozen=True)
 class TraitAccuracy:
-    """Accuracy of a linear support vector classifier on the latent mean, on windows of unseen episodes."""
+    """How well the latent mean tells the traits apart, on windows of unseen episodes."""
 
-    accuracy: float
+    accuracy: float  # of a linear support vector classifier
+    knn_accuracy: float  # of the nearest neighbours in the latent space
     windows: int
+    error_m: float | None  # root mean square of reconstructed or predicted positions; None if the method has none
+    errors_in_most_uncertain_tenth: float | None  # share of the linear classifier's errors; None without errors
     by_length: Mapping[str, Part]  # keyed "2-5", "6-10", "11-19", "20"
     by_leader: Mapping[str, Part]  # keyed "with_leader", "without_leader"
 
 
-def evaluate(model: TraitModel, windows: Windows, conservative: NDArray[np.bool_], *, seed: int = 0) -> TraitAccuracy:
-    """Fit a linear classifier on two thirds of the episodes and test it on the rest (paper IV-B).
+@dataclass(frozen=True)
+class Latents:
+    """Gaussians over the latents of N windows."""
+
+    mean: NDArray[np.float32]  # (N, latent_size)
+    std: NDArray[np.float32]  # (N, latent_size)
+
+
+class Probe:
+    """Classifiers on the latents of one model, fitted once and applied to any windows.
+
+    Args:
+        model: a trained model; it is not changed.
+        windows: N windows to fit on.
+        conservative: (N,) the label of each window's driver.
+        noise_m: standard deviation of the noise on every position, here and in ``score``.
+        seed: of the noise and of the neighbours' choice.
+
+    Raises:
+        InputError: the windows do not hold both traits.
+    """
+
+    def __init__(
+        self,
+        model: TraitModel,
+        windows: Windows,
+        conservative: NDArray[np.bool_],
+        *,
+        noise_m: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        if len(np.unique(conservative)) < 2:
+            raise InputError("both traits and several episodes are needed to evaluate; record a larger dataset")
+        self._model, self._noise_m, self._seed = model, noise_m, seed
+        mean = encode_windows(model, windows, noise_m=noise_m, seed=seed).mean
+        reference = np.random.default_rng(seed).permutation(len(mean))[:KNN_REFERENCES]
+        self._linear: Pipeline = make_pipeline(StandardScaler(), LinearSVC()).fit(mean, conservative)
+        neighbours = KNeighborsClassifier(min(NEIGHBOURS, len(reference)))
+        self._nearest: Pipeline = make_pipeline(StandardScaler(), neighbours)
+        self._nearest.fit(mean[reference], conservative[reference])
+
+    def score(self, windows: Windows, conservative: NDArray[np.bool_]) -> TraitAccuracy:
+        """Accuracy on N windows, which the probe should not have been fitted on; the noise is drawn from its seed.
+
+        Raises:
+            InputError: there are no windows.
+        """
+        if len(windows) == 0:
+            raise InputError("there are no windows to evaluate on; record a larger dataset")
+        latents = encode_windows(self._model, windows, noise_m=self._noise_m, seed=self._seed + 1)
+        correct = self._linear.predict(latents.mean) == conservative
+        nearest = self._nearest.predict(latents.mean) == conservative
+        length, has_leader = windows.length, windows.has_leader
+        return TraitAccuracy(
+            accuracy=float(correct.mean()),
+            knn_accuracy=float(nearest.mean()),
+            windows=len(windows),
+            error_m=position_error_m(self._model, windows, noise_m=self._noise_m, seed=self._seed + 1),
+            errors_in_most_uncertain_tenth=_share_of_errors(correct, latents.std),
+            by_length={
+                str(low) if low == high else f"{low}-{high}": _part(correct[(length >= low) & (length <= high)])
+                for low, high in LENGTH_BINS
+            },
+            by_leader={"with_leader": _part(correct[has_leader]), "without_leader": _part(correct[~has_leader])},
+        )
+
+
+def evaluate(
+    model: TraitModel, windows: Windows, conservative: NDArray[np.bool_], *, noise_m: float = 0.0, seed: int = 0
+) -> TraitAccuracy:
+    """Fit classifiers on two thirds of the episodes and test them on the rest (paper IV-B).
 
     Args:
         model: a trained model; it is not changed.
         windows: N windows.
         conservative: (N,) the label of each window's driver.
+        noise_m: standard deviation of the noise on every position.
         seed: of the split. Use the one of training, so that the test episodes are unseen by the model too.
 
     Raises:
         InputError: the training part does not hold both traits, or the test part is empty.
     """
     train, test = split_by_episode(windows, TEST_FRACTION, seed)
-    if len(np.unique(conservative[train])) < 2 or len(test) == 0:
-        raise InputError("both traits and several episodes are needed to evaluate; record a larger dataset")
-    latents = encode_windows(model, windows)
-    classifier = make_pipeline(StandardScaler(), LinearSVC()).fit(latents[train], conservative[train])
-    correct = classifier.predict(latents[test]) == conservative[test]
-    length, has_leader = windows.length[test], windows.has_leader[test]
-    return TraitAccuracy(
-        accuracy=float(correct.mean()),
-        windows=len(test),
-        by_length={
-            str(low) if low == high else f"{low}-{high}": _part(correct[(length >= low) & (length <= high)])
-            for low, high in LENGTH_BINS
-        },
-        by_leader={"with_leader": _part(correct[has_leader]), "without_leader": _part(correct[~has_leader])},
-    )
+    probe = Probe(model, windows[train], conservative[train], noise_m=noise_m, seed=seed)
+    return probe.score(windows[test], conservative[test])
 
 
-def encode_windows(model: TraitModel, windows: Windows) -> NDArray[np.float32]:
-    """Latent means (N, latent_size)."""
-    states, length = torch.from_numpy(windows.states), torch.from_numpy(windows.length)
-    with torch.inference_mode():
-        parts = [
-            model.encode(states[start : start + ENCODING_BATCH], length[start : start + ENCODING_BATCH])[0]
-            for start in range(0, len(length), ENCODING_BATCH)
-        ]
-    return torch.cat(parts).numpy()
-
-
-def plot_latents(
-    model: TraitModel, windows: Windows, conservative: NDArray[np.bool_], file: Path, *, seed: int = 0
-) -> None:
-    """Write a PNG of the first two latent means, coloured by trait (paper Fig. 3).
+def linear_r2(
+    model: TraitModel, windows: Windows, properties: NDArray[np.floating], *, noise_m: float = 0.0, seed: int = 0
+) -> NDArray[np.float64]:
+    """How well a linear map from the latent mean gives properties of the driver, on unseen episodes.
 
     Args:
-        model: a trained model with at least two latents.
-        windows: N windows, best those of unseen episodes; a random part of them is drawn.
-        conservative: (N,) the label of each window's driver.
-        file: where the PNG goes.
-        seed: of the part that is drawn.
+        model: a trained model; it is not changed.
+        windows: N windows.
+        properties: (N, P), such as desired speed and minimum gap.
+        noise_m: standard deviation of the noise on every position.
+        seed: of the split, as in ``evaluate``.
+
+    Returns:
+        (P,) coefficients of determination R2; 1 is perfect, 0 no better than the mean.
     """
-    generator = np.random.default_rng(seed)
-    drawn = generator.choice(len(windows.length), min(DRAWN_WINDOWS, len(windows.length)), replace=False)
-    latents, is_conservative = encode_windows(model, windows)[drawn], conservative[drawn]
-    colours = np.where(is_conservative[:, None], _rgb(CONSERVATIVE), _rgb(AGGRESSIVE))
-
-    figure = Figure(figsize=(6.0, 5.0), dpi=150, layout="constrained")
-    axes = figure.subplots()
-    axes.scatter(latents[:, 0], latents[:, 1], s=6, c=colours, alpha=0.4, linewidths=0)
-    for profile, count in ((CONSERVATIVE, is_conservative.sum()), (AGGRESSIVE, (~is_conservative).sum())):
-        axes.scatter([], [], s=30, color=_rgb(profile), label=f"{profile.name} ({count} windows)")
-    axes.set(xlabel="latent 1", ylabel="latent 2", title=f"Latent space of '{model.method}' (mean of each window)")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, frameon=False)
-    axes.grid(alpha=0.25)
-    with whole_file(file) as partial:
-        figure.savefig(partial, format="png")
+    train, test = split_by_episode(windows, TEST_FRACTION, seed)
+    mean = encode_windows(model, windows, noise_m=noise_m, seed=seed).mean
+    fitted = LinearRegression().fit(mean[train], properties[train])
+    residual = properties[test] - fitted.predict(mean[test])
+    return np.asarray(1.0 - residual.var(axis=0) / properties[test].var(axis=0))
 
 
-def _rgb(profile: DriverProfile) -> tuple[float, ...]:
-    return tuple(int(part) / 255 for part in profile.colour.split(","))
+def encode_windows(model: TraitModel, windows: Windows, *, noise_m: float = 0.0, seed: int = 0) -> Latents:
+    """Latents of N windows, measured with noise drawn from ``seed``."""
+    parts = []
+    with torch.inference_mode():
+        for states, length in _measured(windows, noise_m, seed):
+            mean, log_var = model.encode(states, length)
+            parts.append(torch.stack((mean, torch.exp(0.5 * log_var))))
+    mean, std = torch.cat(parts, dim=1).numpy()
+    return Latents(mean, std)
+
+
+def _measured(windows: Windows, noise_m: float, seed: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """States and lengths, a batch at a time; the noise does not depend on the size of the batches."""
+    everything = TrainingWindows(windows).batch(torch.arange(len(windows)), torch.Generator())
+    everything = everything.with_noise(noise_m, torch.Generator().manual_seed(seed))
+    for index in _batches(len(windows)):
+        yield everything.states[index], everything.length[index]
+
+
+def _batches(windows: int) -> Iterator[slice]:
+    for start in range(0, windows, ENCODING_BATCH):
+        yield slice(start, start + ENCODING_BATCH)
+
+
+def position_error_m(model: TraitModel, windows: Windows, *, noise_m: float = 0.0, seed: int = 0) -> float | None:
+    """Root mean square error of the positions that the model reconstructs or predicts, against the measured ones."""
+    generator = torch.Generator().manual_seed(seed)
+    data = TrainingWindows(windows, with_other=model.uses_other_window)
+    total, count = 0.0, 0
+    with torch.inference_mode():
+        for part in _batches(len(windows)):
+            index = torch.arange(len(windows))[part]
+            errors = model.squared_errors_m2(data.batch(index, generator).with_noise(noise_m, generator))
+            total, count = total + float(errors.sum()), count + len(errors)
+    return (total / count) ** 0.5 if count else None
+
+
+def _share_of_errors(correct: NDArray[np.bool_], std: NDArray[np.float32]) -> float | None:
+    """Share of the errors that lie among the tenth of the windows with the widest posterior; chance is 0.1."""
+    if correct.all():
+        return None
+    widest = np.argsort(-std.prod(axis=1), kind="stable")[: -(-len(correct) // 10)]
+    return float((~correct[widest]).sum() / (~correct).sum())
 
 
 def _part(correct: NDArray[np.bool_]) -> Part:

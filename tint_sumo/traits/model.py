@@ -6,10 +6,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from tint_sumo.config import LATENT_SIZE, VaeSettings
+from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.errors import InputError
+from tint_sumo.traits.batches import Batch
+from tint_sumo.traits.encoder import WindowEncoder
 
-FEATURES = 2  # numbers per step that a network sees: displacement and gap
+FEATURES = 2  # numbers per step: displacement and gap
 FEATURE_SPREAD = (2.0, 1.0)  # standard deviation of the scaled displacement and gap in the training data
 SMALLEST_STD = 1e-6  # a feature that varies less is a constant and is only centred
 
@@ -31,38 +33,57 @@ class TraitModel(nn.Module, ABC):
     """
 
     method: ClassVar[str]
+    feature_spread: ClassVar[tuple[float, ...]] = FEATURE_SPREAD
+    undefined_steps: ClassVar[tuple[int, ...]] = (1, 0)  # leading steps at which each feature is unknown, and zero
+    uses_other_window: ClassVar[bool] = False  # whether the loss takes another window of the same driver
+    uses_labels: ClassVar[bool] = False  # whether the loss takes the true traits
 
     feature_mean: Tensor
     feature_scale: Tensor
 
-    def __init__(self, settings: VaeSettings, latent_size: int = LATENT_SIZE) -> None:
+    def __init__(self, settings: TraitSettings, latent_size: int = LATENT_SIZE) -> None:
         super().__init__()
         self.settings = settings
         self.latent_size = latent_size
-        self.register_buffer("feature_mean", torch.zeros(FEATURES))
-        self.register_buffer("feature_scale", torch.ones(FEATURES))
+        self.register_buffer("feature_mean", torch.zeros(len(self.feature_spread)))
+        self.register_buffer("feature_scale", torch.ones(len(self.feature_spread)))
+        self.encoder = WindowEncoder(len(self.feature_spread), settings, latent_size)
 
     @abstractmethod
-    def encode(self, states: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log-variance of the latent, each (N, latent_size)."""
-
-    @abstractmethod
-    def loss(self, states: Tensor, length: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+    def loss(self, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         """Named scalar terms of the training loss and ``"total"``, the one to minimise."""
 
+    @abstractmethod
+    def squared_errors_m2(self, batch: Batch) -> Tensor:
+        """Squared errors (M,) in m2 of all positions that the latent means predict; M is 0 if they predict none."""
+
+    def encode(self, states: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log-variance of the latent, each (N, latent_size)."""
+        return self.encoder(self.features(states, length), length)  # type: ignore[no-any-return]
+
+    def raw_features(self, states: Tensor) -> Tensor:
+        """Features (N, T, F) before they are scaled."""
+        return displacement_and_gap(states)
+
     def fit_features(self, states: Tensor, length: Tensor) -> None:
-        """Set the scaling from training windows; the first step, which has no displacement, is left out."""
-        raw = displacement_and_gap(states)[:, 1:]
-        values = raw[valid_steps(states, length)[:, 1:]].double()
-        std = values.std(dim=0, correction=0)
-        self.feature_mean.copy_(values.mean(dim=0))
-        self.feature_scale.copy_(torch.where(std < SMALLEST_STD, 1.0, std) / torch.tensor(FEATURE_SPREAD))
+        """Set the scaling from training windows."""
+        raw, known = self.raw_features(states).double(), self._known(states, length)
+        for feature, spread in enumerate(self.feature_spread):
+            values = raw[..., feature][known[..., feature]]
+            std = values.std(correction=0) if len(values) else torch.zeros(())
+            self.feature_mean[feature] = values.mean() if len(values) else 0.0
+            self.feature_scale[feature] = (std if std >= SMALLEST_STD else 1.0) / spread
 
     def features(self, states: Tensor, length: Tensor) -> Tensor:
-        """Scaled displacement and gap (N, T, 2), zero after ``length``; the first displacement is zero too."""
-        features = (displacement_and_gap(states) - self.feature_mean) / self.feature_scale
-        features[:, 0, 0] = 0.0
-        return torch.where(valid_steps(states, length).unsqueeze(-1), features, 0.0)
+        """Scaled features (N, T, F), zero after ``length`` and where they are unknown."""
+        scaled = (self.raw_features(states) - self.feature_mean) / self.feature_scale
+        return torch.where(self._known(states, length), scaled, 0.0)
+
+    def _known(self, states: Tensor, length: Tensor) -> Tensor:
+        """(N, T, F): the valid steps at which a feature is known."""
+        step = torch.arange(states.shape[1], device=states.device).unsqueeze(-1)
+        since = step >= torch.tensor(self.undefined_steps, device=states.device)
+        return valid_steps(states, length).unsqueeze(-1) & since
 
 
 def displacement_and_gap(states: Tensor) -> Tensor:

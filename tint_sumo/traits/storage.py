@@ -8,7 +8,7 @@ from typing import Any
 import safetensors.torch
 from safetensors import SafetensorError
 
-from tint_sumo.config import VaeSettings
+from tint_sumo.config import TraitSettings
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, shipped, whole_file, write_json
 from tint_sumo.traits.model import METHODS, TraitModel
@@ -112,7 +112,7 @@ def _build(card: Mapping[str, Any], stem: Path) -> TraitModel:
         key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"].items()
     }
     try:
-        return METHODS[card["method"]](VaeSettings(**settings), card["latent_size"])
+        return METHODS[card["method"]](TraitSettings(**settings), card["latent_size"])
     except (TypeError, ValueError, RuntimeError, IndexError) as error:
         raise InputError(
             f"{_card_file(stem)}: unusable settings ({error}); restore the file or train the model again"

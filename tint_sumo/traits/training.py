@@ -1,4 +1,4 @@
-"""Training of a trait model on windows, without labels; interruptible and exactly resumable."""
+"""Training of a trait model on windows; interruptible and exactly resumable."""
 
 import hashlib
 import time
@@ -9,29 +9,34 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
+from torch import nn
 from tqdm import tqdm
 
-from tint_sumo.config import LATENT_SIZE, VaeSettings
+from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file
+from tint_sumo.progress import make_bar
+from tint_sumo.traits.batches import Batch, TrainingWindows
 from tint_sumo.traits.model import TraitModel, find_method
 from tint_sumo.traits.storage import RUN_MODEL, load, save
 
 CHECKPOINT_FILE = "checkpoint.pt"
 CHECKPOINT_INTERVAL_S = 10.0
+MAX_GRAD_NORM = 1.0  # a rare batch must not undo the others
 BFLOAT16_HIDDEN_SIZE = 64  # from this size on bfloat16 is the faster one on CPUs
 
 
 def train(
     windows: Windows,
-    settings: VaeSettings,
+    settings: TraitSettings,
     out: Path,
     *,
     method: str = "ours",
     seed: int = 0,
     latent_size: int = LATENT_SIZE,
+    conservative: NDArray[np.bool_] | None = None,
     progress: bool = True,
     card: Mapping[str, Any] | None = None,
 ) -> TraitModel:
@@ -45,8 +50,9 @@ def train(
         settings: sizes, loss weights and schedule.
         out: a new folder, or the one of this very run.
         method: a name in ``METHODS``.
-        seed: of the initial weights, the order of windows and the latent noise.
+        seed: of the initial weights, the order of windows and all noise.
         latent_size: numbers that represent a trait.
+        conservative: (N,) the true traits, for a method that is trained with them; no other method may have them.
         progress: show a progress bar on stderr.
         card: what else the model's card shall say, such as where the windows come from.
 
@@ -59,6 +65,8 @@ def train(
     model_type = find_method(method)
     if len(windows.length) == 0:
         raise InputError("there are no windows to train on; record a dataset with more of them")
+    if model_type.uses_labels is not (conservative is not None):
+        raise ValueError(f"labels are for the methods that learn with them: {method}.uses_labels")
     identity = {
         "task": "traits train",
         "method": method,
@@ -74,7 +82,9 @@ def train(
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(_stream_seed(seed, 0))
             model = model_type(settings, latent_size)
-        run = _Run(model, torch.from_numpy(windows.states), torch.from_numpy(windows.length), settings, seed)
+        labels = None if conservative is None else torch.from_numpy(conservative)
+        data = TrainingWindows(windows, labels, with_other=model_type.uses_other_window)
+        run = _Run(model, data, settings, seed)
         loss = run.fit(out / CHECKPOINT_FILE, progress)
 
         known = {key: identity[key] for key in ("seed", "windows", "windows_sha256")}
@@ -86,10 +96,9 @@ def train(
 class _Run:
     """One training run: a model, its windows as tensors, and the optimiser."""
 
-    def __init__(self, model: TraitModel, states: Tensor, length: Tensor, settings: VaeSettings, seed: int) -> None:
+    def __init__(self, model: TraitModel, data: TrainingWindows, settings: TraitSettings, seed: int) -> None:
         self.model = model
-        self.states = states
-        self.length = length
+        self.data = data
         self.settings = settings
         self.seed = seed
         self.optimiser = torch.optim.Adam(
@@ -101,7 +110,9 @@ class _Run:
 
         Each epoch draws from a generator of its own, so a checkpoint needs no generator states.
         """
-        self.model.fit_features(self.states, self.length)
+        everything = Batch(self.data.states, self.data.length)
+        measured = everything.with_noise(self.settings.noise_m, self._generator(0))
+        self.model.fit_features(measured.states, measured.length)
         done, loss = self._resume(checkpoint)
         saved_at = time.monotonic()
         with self._bar(done, progress) as bar:
@@ -114,8 +125,8 @@ class _Run:
         return loss
 
     def _bar(self, done: int, progress: bool) -> "tqdm[NoReturn]":
-        windows = len(self.length)
-        return tqdm(
+        windows = len(self.data.length)
+        return make_bar(
             desc=f"traits {self.model.method}",
             total=self.settings.epochs * windows,
             initial=done * windows,
@@ -126,28 +137,33 @@ class _Run:
 
     def _run_epoch(self, epoch: int, bar: "tqdm[NoReturn]") -> dict[str, float]:
         """One pass over the shuffled windows; the mean of each loss term over the batches."""
-        generator = torch.Generator().manual_seed(_stream_seed(self.seed, 1 + epoch))
-        order = torch.randperm(len(self.length), generator=generator)
+        generator = self._generator(1 + epoch)
+        order = torch.randperm(len(self.data.length), generator=generator)
         starts = range(0, len(order), self.settings.batch_size)
         sums: dict[str, float] = {}
-        for index, start in enumerate(starts):
-            batch = order[start : start + self.settings.batch_size]
-            terms = self._step(batch, 1.0 - (epoch + index / len(starts)) / self.settings.epochs, generator)
+        for number, start in enumerate(starts):
+            index = order[start : start + self.settings.batch_size]
+            batch = self.data.batch(index, generator).with_noise(self.settings.noise_m, generator)
+            terms = self._step(batch, 1.0 - (epoch + number / len(starts)) / self.settings.epochs, generator)
             for name, value in terms.items():
                 sums[name] = sums.get(name, 0.0) + value
-            bar.update(len(batch))
+            bar.update(len(index))
         return {name: value / len(starts) for name, value in sums.items()}
 
-    def _step(self, batch: Tensor, remaining: float, generator: torch.Generator) -> dict[str, float]:
+    def _step(self, batch: Batch, remaining: float, generator: torch.Generator) -> dict[str, float]:
         """One gradient step at the fraction ``remaining`` of the learning rate; the loss terms."""
         for group in self.optimiser.param_groups:
             group["lr"] = self.settings.learning_rate * remaining
         with torch.autocast("cpu", torch.bfloat16, enabled=self.settings.hidden_size >= BFLOAT16_HIDDEN_SIZE):
-            terms = self.model.loss(self.states[batch], self.length[batch], generator)
+            terms = self.model.loss(batch, generator)
         self.optimiser.zero_grad()
         torch.autograd.backward(terms["total"])
+        nn.utils.clip_grad_norm_(self.model.parameters(), MAX_GRAD_NORM)
         self.optimiser.step()
         return {name: value.item() for name, value in terms.items()}
+
+    def _generator(self, stream: int) -> torch.Generator:
+        return torch.Generator().manual_seed(_stream_seed(self.seed, stream))
 
     def _resume(self, checkpoint: Path) -> tuple[int, dict[str, float]]:
         """Take over ``checkpoint`` if there is one; the number of finished epochs and the last one's loss terms."""

@@ -1,0 +1,195 @@
+"""Table and figure of the comparison of trait methods, from the results of its jobs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from tint_sumo.errors import InputError
+from tint_sumo.files import read_json, whole_file, write_text
+from tint_sumo.study.results import RESULTS
+
+COLOURS = {"ours": "#1b6ca8", "ours_plus": "#0b7a3b", "morton": "#c8682c", "classifier": "#555555"}
+
+
+@dataclass(frozen=True)
+class TraitReport:
+    """What was written, and the tables themselves."""
+
+    table: pd.DataFrame  # a row per method and noise; every measure's mean and standard deviation over the seeds
+    markdown: str
+    csv_file: Path
+    markdown_file: Path
+    figure_file: Path
+
+
+def write_trait_report(out: Path) -> TraitReport:
+    """Write traits.csv, traits_seeds.csv, traits.md and traits.png into a trait study's folder.
+
+    Raises:
+        InputError: there are no results, or a file is damaged.
+    """
+    contents = _read_results(out)
+    seeds = pd.DataFrame([_flat(content) for content in contents if content["kind"] == "comparison"])
+    continuous = pd.DataFrame([_flat(content) for content in contents if content["kind"] == "continuous"])
+    table = aggregate(seeds)
+    markdown = to_markdown(table, continuous)
+    report = TraitReport(table, markdown, out / "traits.csv", out / "traits.md", out / "traits.png")
+    write_text(out / "traits_seeds.csv", seeds.to_csv(index=False))
+    if len(continuous):
+        write_text(out / "traits_continuous.csv", continuous.to_csv(index=False))
+    write_text(report.csv_file, table.to_csv(index=False))
+    write_text(report.markdown_file, markdown)
+    plot_noise(table, report.figure_file)
+    return report
+
+
+def _read_results(out: Path) -> list[dict[str, Any]]:
+    files = sorted((out / RESULTS).glob("*.json"))
+    contents = [read_json(file, "result of a trait study") for file in files]
+    for file, content in zip(files, contents, strict=True):
+        if content.get("kind") not in ("comparison", "continuous"):
+            raise InputError(f"{file} is not a result of a trait study; remove it and run the study again")
+    if not any(content["kind"] == "comparison" for content in contents):
+        raise InputError(f"no results in {out}; run the study first: tint-sumo traits study --out {out}")
+    return contents
+
+
+def _flat(content: dict[str, Any]) -> dict[str, Any]:
+    """A result as one row: fractions as percentages, parts as columns of their own."""
+    row = {key: value for key, value in content.items() if not isinstance(value, dict) and key != "kind"}
+    for key, name in (("accuracy", "svc_percent"), ("knn_accuracy", "knn_percent")):
+        if key in row:
+            row[name] = 100.0 * row.pop(key)
+    for group in ("by_length", "by_leader"):
+        for part, found in content.get(group, {}).items():
+            value = found["accuracy"]
+            row[f"svc_{part.replace('-', '_to_')}_percent"] = None if value is None else 100.0 * value
+    row |= {f"svc_P{p}_percent": 100.0 * value for p, value in content.get("by_p", {}).items()}
+    return row | {f"r2_{name}": value for name, value in content.get("r2", {}).items()}
+
+
+def aggregate(seeds: pd.DataFrame) -> pd.DataFrame:
+    """A row per method and noise: mean of every measure over the seeds, and its sample standard deviation ("_sd")."""
+    keys = ["method", "noise_m"]
+    groups = seeds.astype({"error_m": float, "training_s": float}).groupby(keys, sort=True)
+    mean = groups.mean(numeric_only=True).drop(columns="seed")
+    spread = groups.std(numeric_only=True).drop(columns=["seed", "windows", "training_windows", "training_s"])
+    joined = mean.join(spread.add_suffix("_sd"))
+    joined.insert(0, "seeds", groups["seed"].count())
+    columns = ["seeds", *(name for one in mean.columns for name in (one, f"{one}_sd") if name in joined)]
+    return joined[columns].reset_index()
+
+
+def to_markdown(table: pd.DataFrame, continuous: pd.DataFrame) -> str:
+    """The tables for readers."""
+    parts = [_accuracy_table(table), _parts_table(table)]
+    if len(continuous):
+        parts.append(_continuous_table(continuous))
+    return "\n\n".join(parts) + "\n"
+
+
+def _accuracy_table(table: pd.DataFrame) -> str:
+    lines = [["method", "noise (m)", "linear SVC %", "nearest neighbours %", "position error (m)", "training (s)"]]
+    for row in table.to_dict("records"):
+        lines.append(
+            [
+                str(row["method"]),
+                f"{row['noise_m']:g}",
+                _mean_sd(row, "svc_percent", ".3f"),
+                _mean_sd(row, "knn_percent", ".3f"),
+                _mean_sd(row, "error_m", ".4f"),
+                "-" if pd.isna(row["training_s"]) else f"{row['training_s']:.0f}",
+            ]
+        )
+    return _markdown(lines) + (
+        f"\n\nMean ± standard deviation over {int(table['seeds'].max())} training seeds; "
+        f"{int(table['training_windows'].mean()):,} training and {int(table['windows'].mean()):,} test windows of "
+        "other episodes. Every model is trained and tested with the noise of its row. Position error: root mean square "
+        "of reconstructed (ours) or next (ours_plus, morton) positions, against the measured ones."
+    )
+
+
+def _parts_table(table: pd.DataFrame) -> str:
+    measures = {
+        "2-5 steps": "svc_2_to_5_percent",
+        "6-10": "svc_6_to_10_percent",
+        "11-19": "svc_11_to_19_percent",
+        "20": "svc_20_percent",
+        "leader": "svc_with_leader_percent",
+        "no leader": "svc_without_leader_percent",
+    }
+    others = [name for name in table.columns if name.startswith("svc_P") and name.endswith("_percent")]
+    measures |= {name.removeprefix("svc_").removesuffix("_percent"): name for name in others}
+    lines = [["method", "noise (m)", *measures]]
+    for row in table.to_dict("records"):
+        cells = ["-" if pd.isna(row[name]) else f"{row[name]:.2f}" for name in measures.values()]
+        lines.append([str(row["method"]), f"{row['noise_m']:g}", *cells])
+    return (
+        _markdown(lines) + "\n\nLinear SVC, percent: by the window's length, with and without a leader, and at another "
+        "P(conservative) with neither model nor classifier trained anew. Means over the seeds."
+    )
+
+
+def _continuous_table(continuous: pd.DataFrame) -> str:
+    measures = [name for name in continuous.columns if name.startswith("r2_")]
+    groups = continuous.groupby(["method", "latent_size"])[measures]
+    mean, spread = groups.mean(), groups.std()
+    lines = [["method", "latents", *(f"R2 of {name.removeprefix('r2_')}" for name in measures)]]
+    for (case, means), (_, spreads) in zip(mean.iterrows(), spread.iterrows(), strict=True):
+        assert isinstance(case, tuple)
+        cells = [_with_spread(means[name], spreads[name], ".3f") for name in measures]
+        lines.append([*map(str, case), *cells])
+    return (
+        _markdown(lines) + "\n\nDrivers without classes: how well a linear map from the latents gives what each driver "
+        "was drawn with, windows of unseen episodes, no noise."
+    )
+
+
+def _mean_sd(row: dict[Any, Any], name: str, form: str) -> str:
+    return "-" if pd.isna(row[name]) else _with_spread(row[name], row[f"{name}_sd"], form)
+
+
+def _with_spread(mean: Any, spread: Any, form: str) -> str:
+    return f"{mean:{form}}" if pd.isna(spread) else f"{mean:{form}} ± {spread:{form}}"
+
+
+def _markdown(lines: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
+    rows = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines
+    ]
+    return "\n".join([rows[0], "| " + " | ".join("-" * width for width in widths) + " |", *rows[1:]])
+
+
+def plot_noise(table: pd.DataFrame, file: Path) -> None:
+    """Write a PNG of the error of the linear classifier against the noise on positions, a line per method."""
+    figure = Figure(figsize=(6.0, 4.2), dpi=150, layout="constrained")
+    axes = figure.subplots()
+    for key, rows in table.groupby("method", sort=False):
+        method = str(key)
+        error = 100.0 - rows["svc_percent"]
+        axes.errorbar(
+            rows["noise_m"],
+            error.clip(lower=0.001),
+            yerr=rows["svc_percent_sd"].fillna(0.0),
+            marker="o",
+            capsize=3,
+            color=COLOURS.get(method),
+            linestyle="--" if method == "classifier" else "-",
+            label=f"{method} (trained with labels)" if method == "classifier" else method,
+        )
+    axes.set(
+        xlabel="noise on every position (m, standard deviation)",
+        ylabel="windows put into the wrong class (%)",
+        yscale="log",
+        xticks=sorted(table["noise_m"].unique()),
+        title="Traits read from two latent numbers",
+    )
+    axes.grid(alpha=0.25, which="both")
+    axes.legend(frameon=False)
+    with whole_file(file) as partial:
+        figure.savefig(partial, format="png")

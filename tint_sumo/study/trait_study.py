@@ -1,0 +1,231 @@
+"""The comparison of trait methods: every method at every position noise, several training seeds, one table."""
+
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tint_sumo.config import TraitSettings
+from tint_sumo.dataset.recorder import record
+from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows, split_by_episode
+from tint_sumo.errors import InputError
+from tint_sumo.files import claim_folder, write_json
+from tint_sumo.study.budgets import TRAIT_BUDGETS
+from tint_sumo.study.pool import THREADS_PER_JOB, Job, run_jobs
+from tint_sumo.study.progress import Report
+from tint_sumo.study.results import RESULTS
+from tint_sumo.study.trait_models import describe
+from tint_sumo.study.trait_report import TraitReport, write_trait_report
+from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, linear_r2
+from tint_sumo.traits.model import find_method
+from tint_sumo.traits.storage import RUN_MODEL, add_to_card
+from tint_sumo.traits.training import train as train_model
+
+DATASET_SEED = 2022
+PROPERTIES = ("desired_speed_mps", "min_gap_m")
+
+
+@dataclass(frozen=True)
+class TraitStudy:
+    """What the comparison runs."""
+
+    windows: int = 696_000  # paper IV-B
+    settings: TraitSettings = TRAIT_BUDGETS["full"]
+    methods: tuple[str, ...] = ("ours", "ours_plus", "morton", "classifier")
+    noises_m: tuple[float, ...] = (0.0, 0.05, 0.1, 0.2)
+    seeds: tuple[int, ...] = (0, 1, 2)
+    p_conservative: float = 0.5  # of the training data
+    other_p: tuple[float, ...] = (0.25, 0.4, 0.6)  # of further test data
+    other_windows: int = 30_000
+    continuous_windows: int = 240_000
+    continuous_methods: tuple[str, ...] = ("ours", "ours_plus")
+    continuous_latents: tuple[int, ...] = (2, 4)
+
+
+def run_trait_study(study: TraitStudy, out: Path, *, workers: int = 2, progress: bool = True) -> TraitReport:
+    """Run the comparison into ``out``; what an earlier, interrupted call has finished is not repeated.
+
+    Args:
+        study: sizes of all stages.
+        out: a new folder, or the one of this very study.
+        workers: processes at a time.
+        progress: show progress bars on stderr.
+
+    Raises:
+        InputError: ``out`` holds another run, or a stage was refused.
+    """
+    if workers < 1:
+        raise InputError(f"workers must be at least 1, not {workers}")
+    for method in study.methods:
+        find_method(method)
+    with claim_folder(out, {"kind": "trait study", **asdict(study)}):
+        for folder, windows, p_conservative in _recordings(study, out):
+            record(
+                folder, windows, p_conservative=p_conservative, seed=DATASET_SEED, workers=workers, progress=progress
+            )
+        if study.continuous_methods:
+            record(
+                out / "continuous",
+                study.continuous_windows,
+                population="continuous",
+                seed=DATASET_SEED,
+                workers=workers,
+                progress=progress,
+            )
+        run_jobs(plan(study, out), workers, progress)
+        return write_trait_report(out)
+
+
+def plan(study: TraitStudy, out: Path) -> list[Job]:
+    """All jobs after the recordings."""
+    comparisons = [CompareJob(study, method, seed, out) for seed in study.seeds for method in study.methods]
+    continuous = [
+        ContinuousJob(study, method, latent_size, seed, out)
+        for seed in study.seeds
+        for method in study.continuous_methods
+        for latent_size in study.continuous_latents
+    ]
+    return [*comparisons, *continuous]
+
+
+def _recordings(study: TraitStudy, out: Path) -> list[tuple[Path, int, float]]:
+    """Folder, windows and P(conservative) of each recording."""
+    others = [(_other_data(out, p), study.other_windows, p) for p in study.other_p]
+    return [(out / "dataset", study.windows, study.p_conservative), *others]
+
+
+def _other_data(out: Path, p_conservative: float) -> Path:
+    return out / f"dataset-P{p_conservative:g}"
+
+
+@dataclass(frozen=True)
+class CompareJob:
+    """Train one method with one seed at every noise, and see how well each model tells the traits apart."""
+
+    study: TraitStudy
+    method: str
+    seed: int
+    out: Path
+
+    @property
+    def name(self) -> str:
+        return f"{self.method} seed{self.seed}"
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return ()
+
+    def is_done(self) -> bool:
+        return all(self._result_file(noise_m).exists() for noise_m in self.study.noises_m)
+
+    def run(self, report: Report) -> str:
+        torch.set_num_threads(THREADS_PER_JOB)
+        windows, conservative = _load(self.out / "dataset")
+        others = {p: _load(_other_data(self.out, p)) for p in self.study.other_p}
+        noises_m = self.study.noises_m
+        for done, noise_m in enumerate(noises_m):
+            report(done, len(noises_m), f"{noise_m:g} m noise")
+            if not self._result_file(noise_m).exists():
+                self._compare(noise_m, windows, conservative, others)
+        return f"{len(noises_m)} noise levels"
+
+    def _compare(
+        self,
+        noise_m: float,
+        windows: Windows,
+        conservative: np.ndarray,
+        others: dict[float, tuple[Windows, np.ndarray]],
+    ) -> None:
+        folder = self.out / "models" / _slug(self.method, noise_m, self.seed)
+        train, test = split_by_episode(windows, TEST_FRACTION, self.seed)
+        resumes = folder.exists()
+        began = time.perf_counter()
+        model = train_model(
+            windows[train],
+            replace(self.study.settings, noise_m=noise_m),
+            folder,
+            method=self.method,
+            seed=self.seed,
+            conservative=conservative[train] if find_method(self.method).uses_labels else None,
+            progress=False,
+            card={"data": describe(self.out / "dataset")},
+        )
+        training_s = None if resumes else round(time.perf_counter() - began, 1)
+        probe = Probe(model, windows[train], conservative[train], noise_m=noise_m, seed=self.seed)
+        found = probe.score(windows[test], conservative[test])
+        by_p = {f"{p:g}": probe.score(*data).accuracy for p, data in others.items()}
+        content = {
+            "kind": "comparison",
+            "method": self.method,
+            "noise_m": noise_m,
+            "seed": self.seed,
+            "training_windows": len(train),
+            "training_s": training_s,
+            **asdict(found),
+            "by_p": by_p,
+        }
+        add_to_card(folder / f"{RUN_MODEL}.safetensors", {"accuracy": found.accuracy})
+        write_json(self._result_file(noise_m), content)
+
+    def _result_file(self, noise_m: float) -> Path:
+        return self.out / RESULTS / f"{_slug(self.method, noise_m, self.seed)}.json"
+
+
+@dataclass(frozen=True)
+class ContinuousJob:
+    """Train a method on drivers without classes, and see how well a line through its latents finds their properties."""
+
+    study: TraitStudy
+    method: str
+    latent_size: int
+    seed: int
+    out: Path
+
+    @property
+    def name(self) -> str:
+        return f"{self.method} continuous {self.latent_size} latents seed{self.seed}"
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return ()
+
+    @property
+    def result_file(self) -> Path:
+        return self.out / RESULTS / f"{self.name.replace(' ', '-')}.json"
+
+    def is_done(self) -> bool:
+        return self.result_file.exists()
+
+    def run(self, report: Report) -> str:
+        torch.set_num_threads(THREADS_PER_JOB)
+        report(0, 1, "training")
+        data = self.out / "continuous"
+        folder = self.out / "models" / self.name.replace(" ", "-")
+        windows = load_windows(data)
+        train, _ = split_by_episode(windows, TEST_FRACTION, self.seed)
+        model = train_model(
+            windows[train],
+            self.study.settings,
+            folder,
+            method=self.method,
+            seed=self.seed,
+            latent_size=self.latent_size,
+            progress=False,
+            card={"data": describe(data)},
+        )
+        properties = load_drivers(data, windows, PROPERTIES).to_numpy(np.float64)
+        r2 = dict(zip(PROPERTIES, linear_r2(model, windows, properties, seed=self.seed).tolist(), strict=True))
+        case = {"kind": "continuous", "method": self.method, "latent_size": self.latent_size, "seed": self.seed}
+        write_json(self.result_file, {**case, "r2": r2})
+        return ", ".join(f"R2 of {name} {value:.3f}" for name, value in r2.items())
+
+
+def _load(data: Path) -> tuple[Windows, np.ndarray]:
+    windows = load_windows(data)
+    return windows, load_labels(data, windows)
+
+
+def _slug(method: str, noise_m: float, seed: int) -> str:
+    return f"{method}-noise{noise_m:g}-seed{seed}"

@@ -37,9 +37,8 @@ def test_acceleration(speed_mps: float, desired_mps: float, unsafe: np.ndarray, 
     ],
 )
 def test_safety_check(distance_m: float, closing_mps: float, unsafe: bool) -> None:
-    far = np.inf
-    found = is_unsafe(np.array([[far, distance_m]]), np.array([[0.0, closing_mps]]), CONTROLLER)
-    assert found.tolist() == [unsafe]
+    found = is_unsafe(np.array([np.inf, distance_m]), np.array([0.0, closing_mps]), CONTROLLER)
+    assert found.tolist() == [False, unsafe]
 
 
 @pytest.mark.parametrize(

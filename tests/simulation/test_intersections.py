@@ -8,7 +8,7 @@ import pytest
 from tests.simulation.scenes import GO, STEP_S, scene
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, MAX_VEHICLES, EgoController, Idm, Population, Scenario, Traffic
 from tint_sumo.errors import InputError
-from tint_sumo.scenario.geometry import LANE_DIRECTION, LOWER, UPPER
+from tint_sumo.scenario.geometry import LANE_DIRECTION, LOWER, UPPER, box_distance_m
 from tint_sumo.simulation.intersections import Intersections, PlacedVehicle
 
 STATE = ("present", "lane", "front_m", "member", "vehicle_number", "ego_front_m", "ego_speed_mps", "has_claimed")
@@ -237,6 +237,11 @@ def test_positions_are_sumos() -> None:
         simulation.close()
 
 
+def ego_distances_m(simulation: Intersections) -> Any:
+    distance_m = box_distance_m(simulation.ego_pose(), simulation.x_m, simulation.y_m, simulation.scenario.vehicle)
+    return np.where(simulation.present, distance_m, np.inf)
+
+
 def test_sumo_reports_a_collision_just_when_the_boxes_overlap() -> None:
     replicas = 40
     careless = EgoController(unsafe_distance_m=0.0, closing_distance_m=0.0)
@@ -247,9 +252,9 @@ def test_sumo_reports_a_collision_just_when_the_boxes_overlap() -> None:
         rng = np.random.default_rng(3)
         collisions = lag = 0
         for step in range(300):
-            overlapped = (simulation._distance_m == 0.0).any(axis=1)
+            overlapped = (ego_distances_m(simulation) == 0.0).any(axis=1)
             simulation.step(rng.choice(DESIRED_MPS, replicas) if step % 20 else np.full(replicas, GO))
-            overlaps = (simulation._distance_m <= 1e-3).any(axis=1)
+            overlaps = (ego_distances_m(simulation) <= 1e-3).any(axis=1)
             for replica in range(replicas):
                 if simulation.collision[replica] is not None:
                     assert overlaps[replica]

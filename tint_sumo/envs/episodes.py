@@ -85,18 +85,20 @@ class Transition:
     @property
     def outcome(self) -> NDArray[np.str_]:
         """``success``, ``collision``, ``timeout`` or the empty string."""
+        if not self.done.any():
+            return np.full(self.done.shape, "")
         ends = [self.success, self.collision, self.timeout]
         return np.select(ends, ["success", "collision", "timeout"], "")
 
 
 def reward_terms(speed_mps: Floats, success: Bools, collision: Bools, preset: RewardPreset) -> dict[str, Floats]:
     """The named terms whose sum is the reward (paper IV-A); (N,) each."""
-    driving = (~(success | collision)).astype(float)
+    driving = ~(success | collision)
     return {
-        "goal": preset.goal * success.astype(float),
-        "collision": preset.collision * collision.astype(float),
+        "goal": np.multiply(preset.goal, success),
+        "collision": np.multiply(preset.collision, collision),
         "speed": preset.speed_weight_per_mps * speed_mps * driving,
-        "step": preset.step * driving,
+        "step": np.multiply(preset.step, driving),
     }
 
 
@@ -106,12 +108,18 @@ def has_reached_goal(pose: Pose, scenario: Scenario) -> Bools:
     return np.asarray((pose.x_m > scenario.episode.goal_x_m) & (off_centre_m < scenario.street.lane_width_m / 4))
 
 
+def _bounded(values: Floats) -> NDArray[np.float32]:
+    return np.minimum(np.maximum(values, -_BOUND), _BOUND).astype(np.float32, order="C")
+
+
 class Episodes:
     """``num_envs`` episodes at a time, each in its own replica with its own random stream."""
 
     def __init__(self, num_envs: int, settings: TaskSettings) -> None:
         self.settings = settings
         self.simulation = Intersections(num_envs, settings.scenario, backend=settings.backend)
+        traits = [1 if member.profile.yields else -1 for member in self.simulation.population]
+        self._trait_of_member = np.array([*traits, 0], np.int8)  # the last: empty slots
         self._preset = REWARD_PRESETS[settings.reward]
         self._speeds_mps = np.array(self.simulation.scenario.ego.desired_speeds_mps)
         self._step_limit = round(settings.time_limit_s / self.simulation.scenario.episode.step_s)
@@ -134,11 +142,11 @@ class Episodes:
         simulation.step(self._speeds_mps[actions])
         self.steps += 1
         self._measure(range(len(self.steps)))
-        collision = np.array([event is not None for event in simulation.collision])
+        collision = simulation.collided.copy()
         success = has_reached_goal(simulation.ego_pose(), simulation.scenario) & ~collision
         timeout = (self.steps >= self._step_limit) & ~(success | collision)
         terms = reward_terms(simulation.ego_speed_mps, success, collision, self._preset)
-        return Transition(np.sum(list(terms.values()), axis=0), terms, success, collision, timeout)
+        return Transition(sum(terms.values(), np.zeros(len(self.steps))), terms, success, collision, timeout)
 
     def _measure(self, indices: Iterable[int]) -> None:
         """Draw the noise of this step's position measurements, from each environment's own generator."""
@@ -152,28 +160,17 @@ class Episodes:
         simulation = self.simulation
         pose = simulation.ego_pose()
         speed = simulation.ego_speed_mps / SPEED_SCALE_MPS
-        ego = np.stack(
-            [
-                pose.x_m / POSITION_SCALE_M,
-                pose.y_m / POSITION_SCALE_M,
-                speed * pose.heading_x,
-                speed * pose.heading_y,
-            ],
-            axis=1,
-        )
-        relative = np.stack([simulation.x_m - pose.x_m[:, None], simulation.y_m - pose.y_m[:, None]], axis=2)
-        relative += self._measured_noise_m
-        relative *= simulation.present[:, :, None] / POSITION_SCALE_M
-        return {
-            "ego": np.clip(ego, -_BOUND, _BOUND).astype(np.float32),
-            "vehicles": np.clip(relative, -_BOUND, _BOUND).astype(np.float32),
-            "mask": simulation.present.astype(np.float32),
-        }
+        x, y = pose.x_m / POSITION_SCALE_M, pose.y_m / POSITION_SCALE_M
+        ego = np.array([x, y, speed * pose.heading_x, speed * pose.heading_y]).T
+        relative_m = self._measured_noise_m.copy()
+        relative_m[:, :, 0] += simulation.x_m - pose.x_m[:, None]
+        relative_m[:, :, 1] += simulation.y_m - pose.y_m[:, None]
+        vehicles = relative_m * (simulation.present[:, :, None] / POSITION_SCALE_M)
+        return {"ego": _bounded(ego), "vehicles": _bounded(vehicles), "mask": simulation.present.astype(np.float32)}
 
     def traits(self) -> NDArray[np.int8]:
         """True traits, (N, 12): 1 conservative, -1 aggressive, 0 in empty slots."""
-        present = self.simulation.present.astype(np.int8)
-        return np.where(self.simulation.yields, present, -present).astype(np.int8)
+        return np.asarray(self._trait_of_member[self.simulation.member])
 
     def collision_info(self, index: int) -> dict[str, Any]:
         """Who was hit where; empty without a collision."""

@@ -104,7 +104,7 @@ class _Replica:
 
     def _turn(self, start_m: float, end_m: float, points: int) -> str:
         """Part of the ego's path, between two path lengths."""
-        x, y = EgoPath(self.street, self.vehicle).point(np.linspace(start_m, end_m, points))
+        x, y, _ = EgoPath(self.street, self.vehicle).point(np.linspace(start_m, end_m, points))
         return self._shape(*zip(x.tolist(), y.tolist(), strict=True))
 
     @property

@@ -7,17 +7,17 @@ from tint_sumo.scenario.geometry import Bools, Floats, lane_y_m
 
 
 def is_unsafe(distance_m: Floats, closing_mps: Floats, controller: EgoController) -> Bools:
-    """Whether any of the (R, V) vehicles is dangerously close; (R,). Absent vehicles have infinite distance."""
+    """Whether each vehicle is dangerously close; any shape. Absent vehicles have infinite distance."""
     close = distance_m < controller.unsafe_distance_m
     closing = (distance_m < controller.closing_distance_m) & (closing_mps > controller.closing_speed_mps)
-    return np.asarray((close | closing).any(axis=1))
+    return np.asarray(close | closing)
 
 
 def acceleration_mps2(speed_mps: Floats, desired_mps: Floats, unsafe: Bools, controller: EgoController) -> Floats:
     """The PD law, or braking where the safety check fires; (R,)."""
     limit, braking_limit = controller.accel_limit_mps2, controller.braking_limit_mps2
-    follow = np.clip(controller.gain_per_s * (desired_mps - speed_mps), -limit, limit)
-    brake = np.clip(-controller.braking_gain_per_s * speed_mps, -braking_limit, braking_limit)
+    follow = np.minimum(np.maximum(controller.gain_per_s * (desired_mps - speed_mps), -limit), limit)
+    brake = np.maximum(-controller.braking_gain_per_s * speed_mps, -braking_limit)
     return np.where(unsafe, brake, follow)
 
 

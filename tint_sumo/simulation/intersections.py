@@ -5,9 +5,10 @@ it runs in. State is kept in arrays, (R,) for egos and (R, 12) for vehicle slots
 per-vehicle call into SUMO each step reads its lane position.
 """
 
+import math
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,9 +35,11 @@ from tint_sumo.scenario.geometry import (
 from tint_sumo.scenario.network import EGO_ROUTE, lane_id, name
 from tint_sumo.simulation import ego as ego_control
 from tint_sumo.simulation.connection import Connection, connect
-from tint_sumo.simulation.traffic import DriverStream
+from tint_sumo.simulation.traffic import DriverPool, DriverStream
 
 _EMPTY = -1
+_OPEN_ROAD_M = 1e9  # gap on a lane without vehicles
+_STEP_MARGIN_M = 1.0  # more than a vehicle and the ego come closer in a step
 _EGO_PREFIX = "ego"
 _SPEED_MODE_OBEY_SETSPEED = 32  # all of SUMO's own checks off: the ego drives exactly the speed it is given
 _IGNORE_ON_JUNCTION = "junctionModel.ignoreTypes"
@@ -85,6 +88,12 @@ def _start(replicas: int, scenario: Scenario, backend: Backend) -> Connection:
         return connect(_sumo_options(Path(folder), scenario.episode.step_s), backend)
 
 
+def _where(mask: Bools) -> Iterator[tuple[int, int]]:
+    """Rows and columns where a matrix is true; faster than np.argwhere where there are few."""
+    rows, columns = np.nonzero(mask)
+    return zip(rows.tolist(), columns.tolist(), strict=True)
+
+
 class Intersections:
     """A batch of ``replicas`` intersections, each empty until its first :meth:`reset`.
 
@@ -100,7 +109,8 @@ class Intersections:
     ``ego_front_m``    (R,)     front bumper's distance along the ego's path
     ``ego_speed_mps``  (R,)
     ``time_s``         (R,)     since the episode's start
-    ``collision``      R items  the ego's first collision in the episode, or None
+    ``collided``       (R,)     whether the ego has had a collision in the episode
+    ``collision``      R items  the first one, or None
     ================== ======== ==================================================================
 
     A vehicle keeps its slot while it is on the street, and a slot stays empty for at least one step between two
@@ -115,8 +125,15 @@ class Intersections:
         self.population = members(scenario.population)
         self.path = EgoPath(scenario.street, scenario.vehicle)
         self._with_ego = with_ego
-        self._yields = np.array([member.profile.yields for member in self.population])
+        self._pool = DriverPool(self.population, scenario)
+        self._yields = np.array([*(member.profile.yields for member in self.population), False])  # the last: empty
+        self._lane_y_m = lane_y_m(scenario.street)
         self._stage_start_m = stage_start_m(scenario.street, scenario.vehicle)
+
+        reach_m = max(scenario.ego.closing_distance_m, scenario.ego.unsafe_distance_m) + _STEP_MARGIN_M
+        reach_m += math.hypot(scenario.vehicle.length_m, scenario.vehicle.width_m) / 2  # of the ego, however it stands
+        self._watch_x_m = reach_m + scenario.vehicle.length_m / 2
+        self._watch_y_m = reach_m + scenario.vehicle.width_m / 2
 
         slots = (replicas, MAX_VEHICLES)
         self.present: Bools = np.zeros(slots, bool)
@@ -129,15 +146,17 @@ class Intersections:
         self.ego_front_m: Floats = np.zeros(replicas)
         self.ego_speed_mps: Floats = np.zeros(replicas)
         self.time_s: Floats = np.zeros(replicas)
+        self.collided: Bools = np.zeros(replicas, bool)
         self.collision: list[Collision | None] = [None] * replicas
-        self._stage = np.zeros(slots, np.int64)  # which of its lane's three SUMO lanes a vehicle is on
-        self._lane_pos_m: Floats = np.zeros(slots)
+        self._pose: Pose | None = None  # of the egos, once somebody has asked for it since they moved
+        self._index: dict[str, int] = {}  # of each vehicle's slot: replica * 12 + slot; so numbered are also these:
+        self._stage = np.zeros(replicas * MAX_VEHICLES, np.int64)  # which of its lane's three SUMO lanes it is on
+        self._lane_pos_m: Floats = np.zeros(replicas * MAX_VEHICLES)
+        self._last_slot = np.full((replicas, 2), _EMPTY)  # of the vehicle that entered each lane last
         self._was_present: Bools = np.zeros(slots, bool)  # at the previous step; such a slot takes no new vehicle yet
-        self._distance_m: Floats = np.full(slots, np.inf)
-        self._closing_mps: Floats = np.zeros(slots)
+        self._distance_m: Floats = np.full(slots, np.inf)  # from the ego, before its last move; infinite if far
         self._claims: Bools = np.zeros((replicas, 2), bool)
         self._ids: list[list[str]] = [[""] * MAX_VEHICLES for _ in range(replicas)]
-        self._slot_of: dict[str, tuple[int, int]] = {}
         self._ego_ids = [""] * replicas
         self._episodes = [0] * replicas
         self._vehicle_count = [0] * replicas
@@ -155,7 +174,7 @@ class Intersections:
     @property
     def yields(self) -> Bools:
         """Which slots hold a yielding (conservative) driver; (R, 12)."""
-        return np.asarray(self.present & self._yields[self.member])
+        return np.asarray(self._yields[self.member])
 
     @property
     def has_claimed(self) -> Bools:
@@ -163,7 +182,9 @@ class Intersections:
         return self._claims
 
     def ego_pose(self) -> Pose:
-        return self.path.pose(self.ego_front_m)
+        if self._pose is None:
+            self._pose = self.path.pose(self.ego_front_m)
+        return self._pose
 
     def close(self) -> None:
         """End the simulation; safe to call twice."""
@@ -174,9 +195,7 @@ class Intersections:
     def reset(self, replica: int, seed: int | Sequence[int] | np.random.SeedSequence) -> None:
         """Empty a replica and start a new random episode in it."""
         sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
-        streams = tuple(
-            DriverStream(np.random.default_rng(child), self.population, self.scenario) for child in sequence.spawn(2)
-        )
+        streams = tuple(DriverStream(np.random.default_rng(child), self._pool) for child in sequence.spawn(2))
         placed = [
             PlacedVehicle(lane, front_m, driver.member)
             for lane, stream in enumerate(streams)
@@ -199,25 +218,26 @@ class Intersections:
         self._episodes[replica] += 1
         self._vehicle_count[replica] = 0
         self.time_s[replica] = 0.0
+        self.collided[replica] = False
         self.collision[replica] = None
         self._claims[replica] = False
         for slot, vehicle in enumerate(vehicles):
             self._add(replica, slot, vehicle)
         if self._with_ego:
             self._add_ego(replica)
-        self._locate(np.array([replica]), started=True)
 
     def clear(self, replica: int) -> None:
         """Empty a replica and leave it so, at next to no cost, until its next reset."""
         vehicle = self._connection.vehicle
         for slot in np.flatnonzero(self.present[replica]):
             vehicle.remove(self._ids[replica][slot])
-            self._forget(replica, int(slot))
+            self._forget(self._ids[replica][slot])
         if self._ego_ids[replica]:
             vehicle.remove(self._ego_ids[replica])
             self._ego_ids[replica] = ""
         self._was_present[replica] = False
         self._wanted_gap_m[replica] = np.inf
+        self._distance_m[replica] = np.inf
 
     def _add_ego(self, replica: int) -> None:
         ego_id = f"{_EGO_PREFIX}.{replica}.{self._episodes[replica]}"
@@ -230,6 +250,7 @@ class Intersections:
         self._ego_ids[replica] = ego_id
         self.ego_front_m[replica] = front_m
         self.ego_speed_mps[replica] = 0.0
+        self._pose = None
 
     def _add(self, replica: int, slot: int, placed: PlacedVehicle) -> None:
         lane, member = placed.lane, self.population[placed.member]
@@ -253,21 +274,29 @@ class Intersections:
         if member.profile.yields and self._claims[replica, lane]:
             self._set_yielding(vehicle_id, placed.member, True)
         self._ids[replica][slot] = vehicle_id
-        self._slot_of[vehicle_id] = (replica, slot)
+        index = replica * MAX_VEHICLES + slot
+        self._index[vehicle_id] = index
         self.present[replica, slot] = True
         self.lane[replica, slot] = lane
         self.member[replica, slot] = placed.member
         self.vehicle_number[replica, slot] = number
-        self._stage[replica, slot] = stage
-        self._lane_pos_m[replica, slot] = position_m
+        self._stage[index] = stage
+        self._lane_pos_m[index] = position_m
         self.front_m[replica, slot] = self._stage_start_m[lane, stage] + position_m
+        self.x_m[replica, slot] = self._centre_x_m(self.front_m[replica, slot], lane)
+        self.y_m[replica, slot] = self._lane_y_m[lane]
+        self._last_slot[replica, lane] = index
 
-    def _forget(self, replica: int, slot: int) -> None:
-        del self._slot_of[self._ids[replica][slot]]
+    def _forget(self, vehicle_id: str) -> None:
+        index = self._index.pop(vehicle_id)
+        replica, slot = divmod(index, MAX_VEHICLES)
         self._ids[replica][slot] = ""
         self.present[replica, slot] = False
         self.member[replica, slot] = _EMPTY
         self.vehicle_number[replica, slot] = _EMPTY
+        lane = self.lane[replica, slot]
+        if self._last_slot[replica, lane] == index:
+            self._last_slot[replica, lane] = _EMPTY
 
     # Steps
 
@@ -279,33 +308,50 @@ class Intersections:
         self._connection.step()
         self.time_s += self.scenario.episode.step_s
         for vehicle_id in self._connection.simulation.getArrivedIDList():
-            if vehicle_id in self._slot_of:
-                self._forget(*self._slot_of[vehicle_id])
+            if vehicle_id in self._index:
+                self._forget(vehicle_id)
             elif vehicle_id in self._ego_ids:
                 self._ego_ids[self._ego_ids.index(vehicle_id)] = ""
         self._read_positions()
         self._admit()
-        self._locate(slice(None))
         if self._with_ego:
             self._latch_collisions()
 
     def _drive_egos(self, desired_speed_mps: Floats) -> None:
         controller, step_s = self.scenario.ego, self.scenario.episode.step_s
         self._update_claims()
-        unsafe = ego_control.is_unsafe(self._distance_m, self._closing_mps, controller)
-        accel = ego_control.acceleration_mps2(self.ego_speed_mps, desired_speed_mps, unsafe, controller)
+        accel = ego_control.acceleration_mps2(self.ego_speed_mps, desired_speed_mps, self._check_safety(), controller)
         self.ego_speed_mps = np.maximum(self.ego_speed_mps + accel * step_s, 0.0)
         self.ego_front_m = self.ego_front_m + self.ego_speed_mps * step_s
+        self._pose = None
         set_speed = self._connection.vehicle.setSpeed
         for ego_id, speed_mps in zip(self._ego_ids, self.ego_speed_mps.tolist(), strict=True):
             if ego_id:
                 set_speed(ego_id, speed_mps)
 
+    def _check_safety(self) -> Bools:
+        """Run the safety check on the vehicles within its reach and a margin for the next step; (R,)."""
+        controller, shape, pose = self.scenario.ego, self.scenario.vehicle, self.ego_pose()
+        is_near = self.present & (np.abs(self.x_m - pose.x_m[:, None]) < self._watch_x_m)
+        is_near &= np.abs(self.y_m - pose.y_m[:, None]) < self._watch_y_m
+        near = np.nonzero(is_near)
+        before_m = self._distance_m[near]
+        self._distance_m.fill(np.inf)
+        unsafe = np.zeros(self.replicas, bool)
+        if len(near[0]):
+            at = (near[0], near[1], None)
+            distance_m = box_distance_m(pose.of(near[0]), self.x_m[at], self.y_m[at], shape)[:, 0]
+            approach_m = np.where(np.isfinite(before_m), before_m, distance_m) - distance_m
+            self._distance_m[near] = distance_m
+            is_unsafe = ego_control.is_unsafe(distance_m, approach_m / self.scenario.episode.step_s, controller)
+            unsafe[near[0][is_unsafe]] = True
+        return unsafe
+
     def _update_claims(self) -> None:
-        _, front_y_m = self.path.point(self.ego_front_m)
-        towards_mps = self.ego_speed_mps * self.path.direction_y(self.ego_front_m)
-        now = ego_control.claims(front_y_m, towards_mps, self.scenario.claim, self.scenario.street)
-        for replica, lane in np.argwhere(now != self._claims).tolist():
+        pose = self.ego_pose()
+        towards_mps = self.ego_speed_mps * pose.front_direction_y
+        now = ego_control.claims(pose.front_y_m, towards_mps, self.scenario.claim, self.scenario.street)
+        for replica, lane in _where(now != self._claims):
             for slot in np.flatnonzero(self.yields[replica] & (self.lane[replica] == lane)):
                 self._set_yielding(self._ids[replica][slot], self.member[replica, slot], bool(now[replica, lane]))
         self._claims = now
@@ -317,24 +363,27 @@ class Intersections:
         vehicle.setMinGap(vehicle_id, self.population[member].min_gap_m + courtesy_m)
 
     def _read_positions(self) -> None:
-        where = np.nonzero(self.present)
-        ids = [self._ids[replica][slot] for replica, slot in zip(*(axis.tolist() for axis in where), strict=True)]
-        position_m = np.fromiter(map(self._connection.vehicle.getLanePosition, ids), float, len(ids))
+        count = len(self._index)
+        slots = np.fromiter(self._index.values(), np.int64, count)
+        position_m = np.fromiter(map(self._connection.vehicle.getLanePosition, self._index), float, count)
         # Vehicles only move forward: a lane position that dropped belongs to the next SUMO lane.
-        self._stage[where] += position_m < self._lane_pos_m[where]
-        self._lane_pos_m[where] = position_m
-        self.front_m[where] = self._stage_start_m[self.lane[where], self._stage[where]] + position_m
+        self._stage[slots] += position_m < self._lane_pos_m[slots]
+        self._lane_pos_m[slots] = position_m
+        stage_start_m = self._stage_start_m[self.lane.reshape(-1)[slots], self._stage[slots]]
+        self.front_m.reshape(-1)[slots] = stage_start_m + position_m
+        self.x_m = self._centre_x_m(self.front_m, self.lane)
+
+    def _centre_x_m(self, front_m: Floats, lane: NDArray[np.int64] | int) -> Floats:
+        return centre_x_m(front_m, lane, self.scenario.street, self.scenario.vehicle)
 
     def _admit(self) -> None:
         """Let the upcoming drivers in where there is room, a free slot, and their time has come."""
         entry_m = self.scenario.vehicle.length_m
-        last_m = np.stack(
-            [np.where(self.present & (self.lane == lane), self.front_m, np.inf).min(axis=1) for lane in (LOWER, UPPER)],
-            axis=1,
-        )
-        # A lane without vehicles has room; a replica without an episode wants an infinite gap.
-        room = np.minimum(last_m - self.scenario.vehicle.length_m - entry_m, 1e9) >= self._wanted_gap_m
-        for replica, lane in np.argwhere(room & (self.time_s[:, None] >= self._wanted_time_s)).tolist():
+        last_m = self.front_m.reshape(-1)[self._last_slot]
+        gap_m = np.where(self._last_slot == _EMPTY, _OPEN_ROAD_M, last_m - self.scenario.vehicle.length_m - entry_m)
+        # A replica without an episode wants an infinite gap.
+        admitted = (gap_m >= self._wanted_gap_m) & (self.time_s[:, None] >= self._wanted_time_s)
+        for replica, lane in _where(admitted):
             free = np.flatnonzero(~(self.present[replica] | self._was_present[replica]))
             if len(free):
                 driver = self._streams[replica][lane].take()
@@ -346,38 +395,21 @@ class Intersections:
         self._wanted_gap_m[replica, lane] = upcoming.gap_m
         self._wanted_time_s[replica, lane] = self.time_s[replica] + upcoming.wait_s
 
-    def _locate(self, rows: slice | NDArray[np.int64], started: bool = False) -> None:
-        """Derive coordinates, and distances from the ego, of the given replicas."""
-        street, shape = self.scenario.street, self.scenario.vehicle
-        lane, present = self.lane[rows], self.present[rows]
-        self.x_m[rows] = centre_x_m(self.front_m[rows], lane, street, shape)
-        self.y_m[rows] = lane_y_m(street)[lane]
-        if not self._with_ego:
-            return
-        pose = self.path.pose(self.ego_front_m[rows])
-        distance_m = np.where(present, box_distance_m(pose, self.x_m[rows], self.y_m[rows], shape), np.inf)
-        if started:
-            self._closing_mps[rows] = 0.0
-        else:
-            known = np.isfinite(self._distance_m[rows]) & np.isfinite(distance_m)
-            change = np.subtract(self._distance_m[rows], distance_m, out=np.zeros_like(distance_m), where=known)
-            self._closing_mps[rows] = change / self.scenario.episode.step_s
-        self._distance_m[rows] = distance_m
-
     def _latch_collisions(self) -> None:
         for event in self._connection.simulation.getCollisions():
             pair = (event.collider, event.victim)
             ego_id = next((one for one in pair if one.startswith(_EGO_PREFIX)), None)
-            other = next((one for one in pair if one in self._slot_of), None)
+            other = next((one for one in pair if one in self._index), None)
             if ego_id is None or other is None:
                 continue
-            replica, slot = self._slot_of[other]
+            replica, slot = divmod(self._index[other], MAX_VEHICLES)
             if self.collision[replica] is None and self._ego_ids[replica] == ego_id:
-                pose = self.path.pose(self.ego_front_m[replica : replica + 1])
+                pose = self.ego_pose()
+                self.collided[replica] = True
                 self.collision[replica] = Collision(
                     slot,
                     self.population[self.member[replica, slot]].profile.name,
                     LANE_NAMES[self.lane[replica, slot]],
-                    float(pose.x_m[0]),
-                    float(pose.y_m[0]),
+                    float(pose.x_m[replica]),
+                    float(pose.y_m[replica]),
                 )

@@ -19,24 +19,33 @@ class Driver:
     wait_s: float  # time since the driver before it; 0 in saturated traffic
 
 
-class DriverStream:
-    """The endless sequence of drivers on one lane; its k-th driver depends on the lane's seed alone."""
+class DriverPool:
+    """Whom all lanes' streams draw from."""
 
-    def __init__(self, rng: np.random.Generator, population: tuple[DriverMember, ...], scenario: Scenario) -> None:
-        self._rng = rng
-        self._population = population
-        self._scenario = scenario
-        self._by_trait = {
+    def __init__(self, population: tuple[DriverMember, ...], scenario: Scenario) -> None:
+        self.population = population
+        self.scenario = scenario
+        self.by_trait = {
             yields: [index for index, member in enumerate(population) if member.profile.yields is yields]
             for yields in (True, False)
         }
+        self.mean_gap_m = float(np.mean([gap for member in population for gap in member.profile.entry_gap_m]))
+        self.lane_length_m = lane_length_m(scenario.street, scenario.vehicle)
+
+
+class DriverStream:
+    """The endless sequence of drivers on one lane; its k-th driver depends on the lane's seed alone."""
+
+    def __init__(self, rng: np.random.Generator, pool: DriverPool) -> None:
+        self._rng = rng
+        self._pool = pool
         self.upcoming = self._draw()
 
     def _draw(self) -> Driver:
-        rng, traffic = self._rng, self._scenario.traffic
-        candidates = self._by_trait[bool(rng.random() < traffic.p_conservative)]
+        rng, pool, traffic = self._rng, self._pool, self._pool.scenario.traffic
+        candidates = pool.by_trait[bool(rng.random() < traffic.p_conservative)]
         member = candidates[int(rng.integers(len(candidates)))]
-        gap_m = rng.uniform(*self._population[member].profile.entry_gap_m)
+        gap_m = rng.uniform(*pool.population[member].profile.entry_gap_m)
         wait_s = 0.0 if traffic.arrivals_per_s is None else rng.exponential(1.0 / traffic.arrivals_per_s)
         return Driver(member, gap_m, wait_s)
 
@@ -47,12 +56,10 @@ class DriverStream:
 
     def placement(self) -> Iterator[tuple[Driver, float]]:
         """Fill the lane as an episode starts, from its exit to its entry: drivers and their ``front_m``."""
-        length_m = self._scenario.vehicle.length_m
-        mean_gap_m = float(np.mean([gap for member in self._population for gap in member.profile.entry_gap_m]))
-        end_m = lane_length_m(self._scenario.street, self._scenario.vehicle)
-        front_m = end_m - (length_m + mean_gap_m) * self._rng.random()
+        pool, length_m = self._pool, self._pool.scenario.vehicle.length_m
+        front_m = pool.lane_length_m - (length_m + pool.mean_gap_m) * self._rng.random()
         while front_m >= length_m:
             yield self.take(), front_m
             follower = self.upcoming
-            waited_m = follower.wait_s * self._population[follower.member].desired_speed_mps
+            waited_m = follower.wait_s * pool.population[follower.member].desired_speed_mps
             front_m -= length_m + follower.gap_m + waited_m

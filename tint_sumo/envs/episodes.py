@@ -15,6 +15,7 @@ from tint_sumo.config import (
     REWARD_PRESETS,
     SPEED_SCALE_MPS,
     Backend,
+    EgoController,
     EpisodeRules,
     RewardPreset,
     Scenario,
@@ -25,9 +26,11 @@ from tint_sumo.scenario.geometry import Bools, Floats, Pose
 from tint_sumo.simulation.intersections import Intersections
 
 Observation = dict[str, NDArray[np.float32]]
+REWARD_TERMS = ("goal", "collision", "speed", "step")
 
 _BOUND = 2.0  # of normalised observations: 40 m, 6 m/s
 _SEED_LIMIT = 2**63
+_ACTIONS_MPS = EgoController().desired_speeds_mps
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,10 @@ class TaskSettings:
         return Scenario(traffic=Traffic(p_conservative=self.p_conservative), episode=rules)
 
 
+def action_space() -> spaces.Discrete:
+    return spaces.Discrete(len(_ACTIONS_MPS))
+
+
 def observation_space() -> spaces.Dict:
     return spaces.Dict(
         {
@@ -62,6 +69,11 @@ def observation_space() -> spaces.Dict:
             "mask": spaces.Box(0.0, 1.0, (MAX_VEHICLES,), np.float32),
         }
     )
+
+
+def require_actions(actions: NDArray[np.integer], num_envs: int) -> None:
+    if actions.shape != (num_envs,) or not ((actions >= 0) & (actions < len(_ACTIONS_MPS))).all():
+        raise InputError(f"actions must be {num_envs} of 0, 1, 2, not {actions.tolist()}")
 
 
 @dataclass(frozen=True)
@@ -121,7 +133,7 @@ class Episodes:
         traits = [1 if member.profile.yields else -1 for member in self.simulation.population]
         self._trait_of_member = np.array([*traits, 0], np.int8)  # the last: empty slots
         self._preset = REWARD_PRESETS[settings.reward]
-        self._speeds_mps = np.array(self.simulation.scenario.ego.desired_speeds_mps)
+        self._speeds_mps = np.array(_ACTIONS_MPS)
         self._step_limit = round(settings.time_limit_s / self.simulation.scenario.episode.step_s)
         self.steps = np.zeros(num_envs, np.int64)
         self._noise = [np.random.default_rng(0) for _ in range(num_envs)]
@@ -136,9 +148,8 @@ class Episodes:
         self._measure([index])
 
     def step(self, actions: NDArray[np.integer]) -> Transition:
+        """Take an action, 0, 1 or 2, in each environment; (N,)."""
         simulation = self.simulation
-        if actions.shape != self.steps.shape or not ((actions >= 0) & (actions < len(self._speeds_mps))).all():
-            raise InputError(f"actions must be {len(self.steps)} of 0, 1, 2, not {actions.tolist()}")
         simulation.step(self._speeds_mps[actions])
         self.steps += 1
         self._measure(range(len(self.steps)))
@@ -167,6 +178,10 @@ class Episodes:
         relative_m[:, :, 1] += simulation.y_m - pose.y_m[:, None]
         vehicles = relative_m * (simulation.present[:, :, None] / POSITION_SCALE_M)
         return {"ego": _bounded(ego), "vehicles": _bounded(vehicles), "mask": simulation.present.astype(np.float32)}
+
+    def time_s(self) -> Floats:
+        """Time since the episodes' start; (N,)."""
+        return np.asarray(self.steps * self.simulation.scenario.episode.step_s)
 
     def traits(self) -> NDArray[np.int8]:
         """True traits, (N, 12): 1 conservative, -1 aggressive, 0 in empty slots."""

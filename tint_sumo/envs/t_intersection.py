@@ -4,11 +4,17 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from tint_sumo.config import Backend
-from tint_sumo.envs.episodes import Episodes, Observation, TaskSettings, observation_space
+from tint_sumo.envs.episodes import (
+    Episodes,
+    Observation,
+    TaskSettings,
+    action_space,
+    observation_space,
+    require_actions,
+)
 from tint_sumo.envs.rendering import RENDER_FPS, render_intersection, require_render_mode
 
 
@@ -91,8 +97,7 @@ class TIntersectionEnv(gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         self.observation_space = observation_space()
         self._episodes = Episodes(1, TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, backend))
-        speeds_mps = self._episodes.simulation.scenario.ego.desired_speeds_mps
-        self.action_space = spaces.Discrete(len(speeds_mps))
+        self.action_space = action_space()
 
     def reset(
         self,
@@ -105,7 +110,9 @@ class TIntersectionEnv(gymnasium.Env[Any, Any]):
         return self._observation(), self._info("")
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        transition = self._episodes.step(np.array([action]))
+        actions = np.array([action])
+        require_actions(actions, 1)
+        transition = self._episodes.step(actions)
         info = self._info(str(transition.outcome[0]))
         info["reward_terms"] = {term: float(value[0]) for term, value in transition.reward_terms.items()}
         if transition.collision[0]:
@@ -122,11 +129,10 @@ class TIntersectionEnv(gymnasium.Env[Any, Any]):
         return {key: value[0] for key, value in self._episodes.observe().items()}
 
     def _info(self, outcome: str) -> dict[str, Any]:
-        step_s = self._episodes.simulation.scenario.episode.step_s
         return {
             "traits": self._episodes.traits()[0],
             "outcome": outcome,
-            "time_s": float(self._episodes.steps[0] * step_s),
+            "time_s": float(self._episodes.time_s()[0]),
         }
 
     def render(self) -> NDArray[np.uint8] | None:

@@ -4,15 +4,22 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from tint_sumo.config import Backend
-from tint_sumo.envs.episodes import Episodes, Observation, TaskSettings, Transition, observation_space
-from tint_sumo.envs.rendering import RENDER_FPS, render_intersection, require_render_mode
+from tint_sumo.envs.batch import Batch, Ended, LocalBatch, Rows
+from tint_sumo.envs.episodes import (
+    REWARD_TERMS,
+    Observation,
+    TaskSettings,
+    action_space,
+    observation_space,
+    require_actions,
+)
+from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
+from tint_sumo.envs.workers import WorkerBatch
 from tint_sumo.errors import InputError
 
 
@@ -23,6 +30,9 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
     seed, whatever ``num_envs`` is. A finished episode is followed by the next one in the same step
     (``AutoresetMode.SAME_STEP``): its last observation and info stand in ``infos["final_obs"]`` and
     ``infos["final_info"]``. All other infos are arrays over the environments.
+
+    With ``workers`` above 1 the environments are shared out among as many processes, with the same results; a script
+    that asks for them needs the usual ``if __name__ == "__main__":``.
     """
 
     metadata = {  # noqa: RUF012 - gymnasium's way
@@ -40,21 +50,23 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         position_noise_m: float = 0.0,
         backend: Backend = "auto",
         render_mode: str | None = None,
+        workers: int = 1,
     ) -> None:
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, not {num_envs}")
+        if not 1 <= workers <= num_envs:
+            raise InputError(f"workers must be 1 to num_envs = {num_envs}, not {workers}")
         require_render_mode(render_mode)
+        settings = TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, backend)
         self.num_envs = num_envs
         self.render_mode = render_mode
-        self._episodes = Episodes(
-            num_envs, TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, backend)
-        )
-        speeds_mps = self._episodes.simulation.scenario.ego.desired_speeds_mps
         self.single_observation_space = observation_space()
-        self.single_action_space = spaces.Discrete(len(speeds_mps))
+        self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._batch: Batch = (
+            LocalBatch(num_envs, settings) if workers == 1 else WorkerBatch(num_envs, settings, workers)
+        )
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -69,53 +81,52 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         if len(seeds) != self.num_envs:
             raise InputError(f"{len(seeds)} seeds do not fit {self.num_envs} environments; give one number or as many")
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
-        for index in np.flatnonzero(mask).tolist():
-            self._begin(index, seeds[index])
-        return self._episodes.observe(), self._infos()
-
-    def _begin(self, index: int, seed: int | None = None) -> None:
-        rng = self._rngs[index]
-        if rng is None or seed is not None:
-            rng, _ = seeding.np_random(seed)
-            self._rngs[index] = rng
-        self._episodes.begin(index, rng)
+        rows = self._batch.reset(seeds, mask)
+        return _observation(rows), self._infos(rows)
 
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        transition = self._episodes.step(np.asarray(actions))
-        done = transition.done
-        observation, infos = self._episodes.observe(), self._infos(transition)
-        if done.any():
-            collisions = [self._episodes.collision_info(index) for index in range(self.num_envs)]
-            final_infos = infos | _masked({"collision": np.array(collisions, dtype=object)}, transition.collision)
-            final_obs = np.full(self.num_envs, None, dtype=object)
-            for index in np.flatnonzero(done).tolist():
-                final_obs[index] = {key: value[index] for key, value in observation.items()}
-                self._begin(index)
-            observation, infos = self._episodes.observe(), self._infos(transition)
-            infos["outcome"] = np.where(done, "", infos["outcome"])
-            infos |= _masked({"final_obs": final_obs, "final_info": final_infos}, done)
-        return observation, transition.reward, transition.terminated, transition.timeout, infos
+        actions = np.asarray(actions)
+        require_actions(actions, self.num_envs)
+        rows, ended = self._batch.step(actions)
+        infos = self._infos(rows)
+        infos |= self._everywhere({"reward_terms": self._everywhere({term: rows[term] for term in REWARD_TERMS})})
+        if ended:
+            infos |= self._final(infos, ended)
+        return _observation(rows), rows["reward"], rows["terminated"], rows["truncated"], infos
 
-    def _infos(self, transition: Transition | None = None) -> dict[str, Any]:
-        everywhere = np.ones(self.num_envs, bool)
-        step_s = self._episodes.simulation.scenario.episode.step_s
-        outcome = np.full(self.num_envs, "") if transition is None else transition.outcome
-        values = {"traits": self._episodes.traits(), "outcome": outcome, "time_s": self._episodes.steps * step_s}
-        infos = _masked(values, everywhere)
-        if transition is not None:
-            infos |= _masked({"reward_terms": _masked(transition.reward_terms, everywhere)}, everywhere)
-        return infos
+    def _infos(self, rows: Rows) -> dict[str, Any]:
+        outcome = np.full(self.num_envs, "")  # an episode that ended has been followed by the next
+        return self._everywhere({"traits": rows["traits"], "outcome": outcome, "time_s": rows["time_s"]})
+
+    def _final(self, infos: dict[str, Any], ended: list[Ended]) -> dict[str, Any]:
+        """The last observation and info of the episodes that ended."""
+        final_obs, collision = (np.full(self.num_envs, None, dtype=object) for _ in range(2))
+        done, collided = (np.zeros(self.num_envs, bool) for _ in range(2))
+        traits, time_s = infos["traits"].copy(), infos["time_s"].copy()
+        outcome = infos["outcome"].astype("U9")
+        for one in ended:
+            done[one.index], collided[one.index] = True, bool(one.collision)
+            final_obs[one.index], collision[one.index] = one.observation, one.collision
+            traits[one.index], outcome[one.index], time_s[one.index] = one.traits, one.outcome, one.time_s
+        final_info = infos | {"traits": traits, "outcome": outcome, "time_s": time_s}
+        final_info |= _masked({"collision": collision}, collided)
+        return _masked({"final_obs": final_obs, "final_info": final_info}, done)
+
+    def _everywhere(self, values: dict[str, Any]) -> dict[str, Any]:
+        return _masked(values, np.ones(self.num_envs, bool))
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One (H, W, 3) image per environment."""
-        if self.render_mode is None:
-            return None
-        return tuple(render_intersection(self._episodes.simulation, index) for index in range(self.num_envs))
+        return None if self.render_mode is None else tuple(self._batch.render())
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002 - gymnasium's signature
-        self._episodes.simulation.close()
+        self._batch.close()
+
+
+def _observation(rows: Rows) -> Observation:
+    return {key: rows[key] for key in ("ego", "vehicles", "mask")}
 
 
 def _masked(values: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:

@@ -3,8 +3,7 @@
 import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from types import FrameType
@@ -13,7 +12,7 @@ from typing import Any, NoReturn, Protocol
 from tqdm import tqdm
 
 from tint_sumo.errors import InputError
-from tint_sumo.processes import SPAWN, end_with_parent
+from tint_sumo.processes import SPAWN, end_with_parent, interrupts_blocked
 from tint_sumo.progress import make_bar
 from tint_sumo.study.progress import Report
 
@@ -97,7 +96,7 @@ class _Worker:
         self.bar: tqdm[NoReturn] = make_bar(desc=job.name, total=1, position=line, leave=False, disable=hidden)
         self.pipe, theirs = SPAWN.Pipe(duplex=False)
         self._process = SPAWN.Process(target=_work, args=(job, theirs), daemon=True)
-        with _interrupts_blocked():
+        with interrupts_blocked():
             self._process.start()
         theirs.close()
 
@@ -132,16 +131,6 @@ class _Worker:
         """Wait for the process to end."""
         self._process.join(INTERRUPT_S)
         self._process.kill()
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Processes started in this block never see Ctrl-C; the main process tells them to end."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(job: Job, pipe: Connection) -> None:

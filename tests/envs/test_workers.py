@@ -1,0 +1,184 @@
+"""Environments in worker processes: the same episodes, and nothing left behind."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from tests.envs.test_environments import assert_equal
+from tint_sumo import ENV_ID
+from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.envs.vector import TIntersectionVectorEnv
+from tint_sumo.errors import InputError
+
+PATIENCE_S = 30.0
+
+
+@pytest.fixture
+def vector() -> Iterator[TIntersectionVectorEnv]:
+    vector = TIntersectionVectorEnv(3, workers=2)
+    yield vector
+    vector.close()
+
+
+def worker_ids() -> list[int]:
+    return [process.pid for process in multiprocessing.active_children() if process.pid is not None]
+
+
+def is_alive(process_id: int) -> bool:
+    """Zombies have ended, too."""
+    stat = Path(f"/proc/{process_id}/stat")
+    return stat.exists() and stat.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+
+
+def wait_until_ended(process_ids: list[int]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while any(map(is_alive, process_ids)):
+        assert time.monotonic() < end, "a worker outlived its main process"
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("workers", [2, 3])
+def test_results_do_not_depend_on_the_number_of_workers(workers: int) -> None:
+    settings: dict[str, Any] = {"time_limit_s": 6.0, "position_noise_m": 0.1, "p_conservative": 0.6}
+    one = TIntersectionVectorEnv(5, **settings)
+    many = TIntersectionVectorEnv(5, **settings, workers=workers)
+    try:
+        assert_equal(one.reset(seed=7)[0], many.reset(seed=7)[0])
+        rng = np.random.default_rng(0)
+        ended = 0
+        for _ in range(150):
+            actions = rng.integers(3, size=5)
+            for first, second in zip(one.step(actions), many.step(actions), strict=True):
+                assert_infos_equal(first, second)
+            ended += int("_final_obs" in first)
+        mask = {"reset_mask": np.array([True, False, False, True, False])}
+        for first, second in zip(one.reset(options=mask), many.reset(options=mask), strict=True):
+            assert_infos_equal(first, second)
+        assert ended >= 2
+    finally:
+        one.close()
+        many.close()
+
+
+def assert_infos_equal(first: Any, second: Any) -> None:
+    """Also within arrays of objects, such as the last observations."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key in first:
+            assert_infos_equal(first[key], second[key])
+    elif isinstance(first, np.ndarray) and first.dtype == object:
+        for a, b in zip(first, second, strict=True):
+            assert_infos_equal(a, b)
+    else:
+        assert np.asarray(first).dtype == np.asarray(second).dtype
+        assert_equal(first, second)
+
+
+def test_the_stable_baselines3_adapter_takes_workers() -> None:
+    one, two = TIntersectionVecEnv(4, seed=3, time_limit_s=2.0), TIntersectionVecEnv(4, 3, time_limit_s=2.0, workers=2)
+    try:
+        assert_equal(one.reset(), two.reset())
+        kept: Any = None
+        for step in range(45):
+            actions = np.full(4, step % 3)
+            first, second = one.step(actions), two.step(actions)
+            for a, b in zip(first[:3], second[:3], strict=True):
+                assert_equal(a, b)
+            for a, b in zip(first[3], second[3], strict=True):
+                assert_infos_equal(a, b)
+            if kept is not None:
+                assert_equal(*kept)  # returned arrays are not reused
+            kept = (second[0], {key: value.copy() for key, value in second[0].items()})
+    finally:
+        one.close()
+        two.close()
+
+
+def test_gymnasium_makes_it_with_workers() -> None:
+    vector = gymnasium.make_vec(
+        ENV_ID, num_envs=2, vectorization_mode="vector_entry_point", workers=2, render_mode="rgb_array"
+    )
+    try:
+        observation, _ = vector.reset(seed=0)
+        assert observation in vector.observation_space
+        images = vector.render()
+        assert images is not None and [image.shape for image in images] == [(320, 736, 3)] * 2
+    finally:
+        vector.close()
+
+
+def test_closing_ends_the_workers(vector: TIntersectionVectorEnv) -> None:
+    ids = worker_ids()
+    assert len(ids) == 2
+    vector.reset(seed=0)
+    vector.close()
+    vector.close()
+    assert not any(map(is_alive, ids))
+    with pytest.raises(RuntimeError, match="closed; make a new one"):
+        vector.step(np.zeros(3, np.int64))
+
+
+def test_a_killed_worker_is_reported_and_ends_the_others(vector: TIntersectionVectorEnv) -> None:
+    vector.reset(seed=0)
+    ids = worker_ids()
+    os.kill(ids[0], signal.SIGKILL)
+    with pytest.raises(RuntimeError, match="died with exit code -9; make a new environment"):
+        for _ in range(3):
+            vector.step(np.zeros(3, np.int64))
+    assert not any(map(is_alive, ids))
+
+
+def test_an_error_in_a_worker_reaches_the_caller(vector: TIntersectionVectorEnv) -> None:
+    with pytest.raises(RuntimeError, match=r"worker 1 failed:\n(?s:.*)Seed must be"):
+        vector.reset(seed=[1, 2, -3])
+    assert not worker_ids()
+
+
+def test_bad_actions_are_refused_before_any_worker_steps(vector: TIntersectionVectorEnv) -> None:
+    vector.reset(seed=0)
+    with pytest.raises(InputError, match="actions must be 3 of 0, 1, 2"):
+        vector.step(np.array([0, 1, 3]))
+    *_, infos = vector.step(np.array([0, 1, 2]))
+    assert infos["time_s"].tolist() == [0.1] * 3
+
+
+@pytest.mark.parametrize("workers", [0, 3])
+def test_the_number_of_workers_must_fit(workers: int) -> None:
+    with pytest.raises(InputError, match=f"workers must be 1 to num_envs = 2, not {workers}"):
+        TIntersectionVectorEnv(2, workers=workers)
+
+
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGINT])
+def test_workers_never_outlive_the_main_process(tmp_path: Path, ending: signal.Signals) -> None:
+    script = tmp_path / "main.py"
+    script.write_text("""
+import multiprocessing
+import numpy as np
+from tint_sumo.envs.vector import TIntersectionVectorEnv
+
+if __name__ == "__main__":
+    vector = TIntersectionVectorEnv(4, workers=2)
+    vector.reset(seed=0)
+    print(*(process.pid for process in multiprocessing.active_children()), flush=True)
+    while True:
+        vector.step(np.zeros(4, np.int64))
+""")
+    main = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert main.stdout is not None and main.stderr is not None
+    ids = [int(word) for word in main.stdout.readline().split()]
+    assert len(ids) == 2
+    time.sleep(0.2)
+    main.send_signal(ending)
+    assert main.wait(PATIENCE_S) != 0
+    wait_until_ended(ids)
+    assert main.stderr.read().count("Traceback") == (0 if ending == signal.SIGKILL else 1)  # the workers say nothing

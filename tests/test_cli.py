@@ -35,6 +35,7 @@ COMMANDS = (
     "policy evaluate",
     "study run",
     "study report",
+    "bench",
 )
 
 

@@ -65,7 +65,7 @@ def test_floors_import_downwards_only() -> None:
         "scenario",
         "simulation",
         "envs dataset",
-        "traits",
+        "traits bench",
         "policy",
         "study",
         "cli",

@@ -339,6 +339,20 @@ class ReportStudy(Command):
         return _report_outcome(write_report(self.out))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Bench(Command):
+    """Measure how fast the environments and the recorder are on this machine, against SUMO's own speed."""
+
+    quick: bool = False
+    """Measure less, for a first look; 3 minutes on a free machine otherwise."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.bench import QUICK, Sizes, run_benchmark
+
+        found = run_benchmark(QUICK if self.quick else Sizes())
+        return Outcome(found.table(), found.to_json())
+
+
 # tyro makes subcommands of unions only, hence the None.
 @dataclass(frozen=True)
 class Dataset:
@@ -384,6 +398,7 @@ class TintSumo:
         | Annotated[Traits, subcommand("traits")]
         | Annotated[Policy, subcommand("policy")]
         | Annotated[Study, subcommand("study")]
+        | Annotated[Bench, subcommand("bench")]
     )
 
 

@@ -64,9 +64,7 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._batch: Batch = (
-            LocalBatch(num_envs, settings) if workers == 1 else WorkerBatch(num_envs, settings, workers)
-        )
+        self.batch: Batch = LocalBatch(num_envs, settings) if workers == 1 else WorkerBatch(num_envs, settings, workers)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -81,7 +79,7 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         if len(seeds) != self.num_envs:
             raise InputError(f"{len(seeds)} seeds do not fit {self.num_envs} environments; give one number or as many")
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
-        rows = self._batch.reset(seeds, mask)
+        rows = self.batch.reset(seeds, mask)
         return _observation(rows), self._infos(rows)
 
     def step(
@@ -89,7 +87,7 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         actions = np.asarray(actions)
         require_actions(actions, self.num_envs)
-        rows, ended = self._batch.step(actions)
+        rows, ended = self.batch.step(actions)
         infos = self._infos(rows)
         infos |= self._everywhere({"reward_terms": self._everywhere({term: rows[term] for term in REWARD_TERMS})})
         if ended:
@@ -119,10 +117,10 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One (H, W, 3) image per environment."""
-        return None if self.render_mode is None else tuple(self._batch.render())
+        return None if self.render_mode is None else tuple(self.batch.render())
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002 - gymnasium's signature
-        self._batch.close()
+        self.batch.close()
 
 
 def _observation(rows: Rows) -> Observation:

@@ -1,0 +1,322 @@
+"""How fast the environments and the recorder are, measured against SUMO's own speed (``tint-sumo bench``).
+
+Whatever is compared is measured in turns within one run, since other work on a machine slows all of it down; what
+comes out is the median of the turns.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import gymnasium
+import numpy as np
+from tqdm import tqdm
+
+from tint_sumo import ENV_ID
+from tint_sumo.envs.batch import LocalBatch
+from tint_sumo.envs.sb3 import TIntersectionVecEnv
+
+BREAKDOWN_METHOD = "clocks around the named functions in a pass of its own, their own cost subtracted"
+
+_MIB = 2**20
+_WARM_UP_STEPS = 100  # of all replicas: their episodes begin together and drift apart
+_RECORD_WORKERS = 2
+_SAMPLING_S = 0.05
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured; steps are those of all replicas together, unless said otherwise."""
+
+    replicas: int = 64
+    turns: int = 9
+    turn_steps: int = 100
+    gym_turn_steps: int = 1_000  # of the single environment
+    windows: int = 100_000
+    memory_env_steps: tuple[int, int] = (100_000, 2_000_000)  # of single intersections: growth from, growth to
+
+
+QUICK = Sizes(turns=3, turn_steps=50, gym_turn_steps=500, windows=10_000, memory_env_steps=(20_000, 100_000))
+
+
+@dataclass(frozen=True)
+class Cores:
+    """Environment steps per second with the replicas in one process and in two workers."""
+
+    one: float
+    two: float
+    ratio: float
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What :func:`run_benchmark` found. A floor is the time spent in SUMO's ``simulationStep`` alone."""
+
+    floor_env_steps_per_s: float
+    env_steps_per_s: float
+    env_to_floor: float
+    gym_env_steps_per_s: float
+    cores: Cores
+    record_windows_per_s: float
+    peak_rss_mib: float  # of the recorder's processes together
+    windows: int
+    memory_growth_mib: float
+    breakdown_us: dict[str, float]  # per environment step
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def table(self) -> str:
+        total_us = sum(self.breakdown_us.values())
+        rows = [
+            ("SUMO's simulationStep alone", f"{self.floor_env_steps_per_s:,.0f} environment steps/s"),
+            ("Stable-Baselines3 environment", f"{self.env_steps_per_s:,.0f} environment steps/s"),
+            ("  its speed to SUMO's alone", f"{self.env_to_floor:.2f}"),
+            ("one gymnasium environment", f"{self.gym_env_steps_per_s:,.0f} steps/s"),
+            ("one process", f"{self.cores.one:,.0f} environment steps/s"),
+            ("two workers", f"{self.cores.two:,.0f} environment steps/s"),
+            ("  their ratio", f"{self.cores.ratio:.2f}"),
+            (f"recorder, {_RECORD_WORKERS} workers", f"{self.record_windows_per_s:,.0f} windows/s"),
+            ("  its processes' peak memory", f"{self.peak_rss_mib:,.0f} MiB"),
+            ("memory growth while stepping", f"{self.memory_growth_mib:+.1f} MiB"),
+            ("where an environment step's time goes", f"{total_us:.1f} us"),
+            *((f"  {part}", f"{us:.1f} us  {us / total_us:4.0%}") for part, us in self.breakdown_us.items()),
+        ]
+        return "\n".join([*(f"{name:38} {value}" for name, value in rows), f"  ({BREAKDOWN_METHOD})"])
+
+
+def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmark:
+    """Measure everything, one after the other."""
+    sizes = sizes or Sizes()
+    measurements = (_speed, _breakdown, _gym_speed, _cores, _record, _memory)
+    found: dict[str, Any] = {}
+    for measurement in tqdm(measurements, desc="bench", unit="measurement", disable=not progress):
+        found |= measurement(sizes)
+    return Benchmark(**found)
+
+
+class _Driven:
+    """A Stable-Baselines3 environment under random actions."""
+
+    def __init__(self, sizes: Sizes, workers: int = 1) -> None:
+        self.env = TIntersectionVecEnv(sizes.replicas, seed=0, workers=workers)
+        self._actions = np.random.default_rng(0).integers(3, size=(sizes.turn_steps, sizes.replicas))
+        self.env.reset()
+        for _ in range(_WARM_UP_STEPS):
+            self.env.step(self._actions[0])
+
+    @property
+    def batch(self) -> LocalBatch:
+        batch = self.env.env.batch
+        assert isinstance(batch, LocalBatch)
+        return batch
+
+    def turn(self) -> int:
+        """Make a turn's steps and return how many environment steps they were."""
+        for actions in self._actions:
+            self.env.step(actions)
+        return int(self._actions.size)
+
+    def steps_per_s(self) -> float:
+        start = time.perf_counter()
+        steps = self.turn()
+        return steps / (time.perf_counter() - start)
+
+
+@contextmanager
+def _driven(sizes: Sizes, workers: int = 1) -> Iterator[_Driven]:
+    driven = _Driven(sizes, workers)
+    try:
+        yield driven
+    finally:
+        driven.env.close()
+
+
+def _speed(sizes: Sizes) -> dict[str, Any]:
+    """In turns: the environment as it is, and the time it spends in simulationStep."""
+    env, floor = [], []
+    with _driven(sizes) as driven:
+        for _ in range(sizes.turns):
+            env.append(driven.steps_per_s())
+            with _Clocks() as clocks:
+                clocks.watch_sumo(driven.batch)
+                floor.append(driven.turn() / clocks.spent_s["sumo"])
+    return {
+        "floor_env_steps_per_s": median(floor),
+        "env_steps_per_s": median(env),
+        "env_to_floor": median(a / b for a, b in zip(env, floor, strict=True)),
+    }
+
+
+def _breakdown(sizes: Sizes) -> dict[str, Any]:
+    with _driven(sizes) as driven, _Clocks() as clocks:
+        simulation, episodes = driven.batch.episodes.simulation, driven.batch.episodes
+        clocks.watch_sumo(driven.batch)
+        clocks.watch(simulation, "_read_positions", "getters")
+        clocks.watch(simulation, "_admit", "spawning")
+        clocks.watch(simulation, "reset", "spawning")
+        clocks.watch(simulation, "_update_claims", "claims")
+        clocks.watch(simulation, "_check_safety", "safety_check")
+        clocks.watch(driven.batch, "_state", "observation")
+        clocks.watch(episodes, "step", "other")  # driving the egos, collisions, rewards
+        clocks.watch(driven.batch, "step", "other")
+        clocks.watch(driven.env, "step", "adapter")
+        steps = sum(driven.turn() for _ in range(sizes.turns))
+    parts = ("sumo", "getters", "spawning", "claims", "safety_check", "observation", "adapter", "other")
+    return {"breakdown_us": {part: clocks.spent_s[part] / steps * 1e6 for part in parts}}
+
+
+class _Clocks:
+    """Clocks around methods; what is spent in a watched method within another one counts for the inner one alone."""
+
+    def __init__(self) -> None:
+        self.spent_s: dict[str, float] = {}
+        self._within_s = [0.0]  # spent in watched methods, at every depth of calls
+        self._cost_s = 0.0
+        self._watched: list[tuple[Any, str, Any]] = []
+        idle = self._clock(lambda: None, "idle")
+        start = time.perf_counter()
+        for _ in range(1000):
+            idle()
+        self._cost_s = (time.perf_counter() - start) / 1000
+
+    def __enter__(self) -> "_Clocks":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for owner, name, method in reversed(self._watched):
+            object.__setattr__(owner, name, method)
+
+    def watch_sumo(self, batch: LocalBatch) -> None:
+        simulation = batch.episodes.simulation
+        connection = simulation._connection
+        self._watched.append((simulation, "_connection", connection))
+        simulation._connection = replace(connection, step=self._clock(connection.step, "sumo"))
+
+    def watch(self, owner: object, name: str, part: str) -> None:
+        method = getattr(owner, name)
+        self._watched.append((owner, name, method))
+        setattr(owner, name, self._clock(method, part))
+
+    def _clock(self, method: Callable[..., Any], part: str) -> Callable[..., Any]:
+        self.spent_s.setdefault(part, 0.0)
+
+        def clocked(*args: Any, **kwargs: Any) -> Any:
+            self._within_s.append(0.0)
+            start = time.perf_counter()
+            result = method(*args, **kwargs)
+            elapsed_s = time.perf_counter() - start
+            self.spent_s[part] += elapsed_s - self._within_s.pop()
+            self._within_s[-1] += elapsed_s + self._cost_s
+            return result
+
+        return clocked
+
+
+def _gym_speed(sizes: Sizes) -> dict[str, Any]:
+    env = gymnasium.make(ENV_ID)
+    actions = np.random.default_rng(0).integers(3, size=sizes.gym_turn_steps)
+    env.reset(seed=0)
+
+    def turn() -> float:
+        start = time.perf_counter()
+        for action in actions:
+            *_, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+        return len(actions) / (time.perf_counter() - start)
+
+    try:
+        turn()
+        return {"gym_env_steps_per_s": median(turn() for _ in range(sizes.turns))}
+    finally:
+        env.close()
+
+
+def _cores(sizes: Sizes) -> dict[str, Any]:
+    """In turns: all replicas in this process, and shared out among two workers."""
+    with _driven(sizes) as one, _driven(sizes, workers=2) as two:
+        speeds = [(one.steps_per_s(), two.steps_per_s()) for _ in range(sizes.turns)]
+    ratio = median(b / a for a, b in speeds)
+    return {"cores": Cores(median(a for a, _ in speeds), median(b for _, b in speeds), ratio)}
+
+
+def _record(sizes: Sizes) -> dict[str, Any]:
+    """The command from its start to its end, as a user waits for it."""
+    command = [sys.executable, "-m", "tint_sumo.cli", "record", "--json", "--windows", str(sizes.windows)]
+    with tempfile.TemporaryDirectory(prefix="tint_sumo.") as folder:
+        out = ["--out", str(Path(folder) / "dataset"), "--workers", str(_RECORD_WORKERS)]
+        start = time.perf_counter()
+        process = subprocess.Popen([*command, *out], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        with _peak_memory(process.pid) as peak_mib:
+            printed, _ = process.communicate()
+        elapsed_s = time.perf_counter() - start
+    if process.returncode != 0:
+        raise RuntimeError(f"the recorder ended with exit code {process.returncode}")
+    windows = json.loads(printed.splitlines()[-1])["windows"]
+    return {"record_windows_per_s": windows / elapsed_s, "peak_rss_mib": max(peak_mib), "windows": windows}
+
+
+def _memory(sizes: Sizes) -> dict[str, Any]:
+    """Growth of this process over many environment steps, episodes ending and beginning all the while."""
+    first, last = sizes.memory_env_steps
+    steps, sizes_mib = 0, []
+    with _driven(sizes) as driven:
+        for goal in (first, last):
+            while steps < goal:
+                steps += driven.turn()
+            sizes_mib.append(_rss_mib("self"))
+    return {"memory_growth_mib": sizes_mib[1] - sizes_mib[0]}
+
+
+@contextmanager
+def _peak_memory(process_id: int) -> Iterator[list[float]]:
+    """Sample the resident memory, summed up, of a process and its descendants; at least one sample."""
+    samples = [_tree_rss_mib(process_id)]
+    ended = threading.Event()
+
+    def sample() -> None:
+        while not ended.wait(_SAMPLING_S):
+            samples.append(_tree_rss_mib(process_id))
+
+    thread = threading.Thread(target=sample)
+    thread.start()
+    try:
+        yield samples
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _tree_rss_mib(process_id: int) -> float:
+    children: dict[int, list[int]] = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        parent = _status(folder.name).get("PPid")
+        if parent is not None:
+            children.setdefault(int(parent), []).append(int(folder.name))
+    tree = [process_id]
+    for one in tree:
+        tree += children.get(one, [])
+    return sum(_rss_mib(str(one)) for one in tree)
+
+
+def _rss_mib(process: str) -> float:
+    return int(_status(process).get("VmRSS", "0 kB").split()[0]) * 1024 / _MIB
+
+
+def _status(process: str) -> dict[str, str]:
+    """What Linux tells about a process; empty if it has ended."""
+    try:
+        lines = Path("/proc", process, "status").read_text(encoding="utf-8").splitlines()
+    except (FileNotFoundError, ProcessLookupError):
+        return {}
+    return {key: value.strip() for key, _, value in (line.partition(":") for line in lines)}

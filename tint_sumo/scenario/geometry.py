@@ -152,7 +152,7 @@ class EgoPath:
         return Pose(x, y, heading_x, heading_y, front_x, front_y, front_direction_y)
 
 
-_CORNERS = np.array([(1.0, 1.0, -1.0, -1.0), (1.0, -1.0, -1.0, 1.0)])[:, :, None, None, None]
+_CORNERS = np.array([(1.0, 1.0, -1.0, -1.0), (1.0, -1.0, -1.0, 1.0)])[:, :, None, None, None, None]
 
 
 def box_distance_m(pose: Pose, x_m: Floats, y_m: Floats, vehicle: VehicleShape) -> Floats:
@@ -165,21 +165,17 @@ def box_distance_m(pose: Pose, x_m: Floats, y_m: Floats, vehicle: VehicleShape) 
     Returns:
         (R, V) distances.
     """
-    half_length, half_width = vehicle.length_m / 2, vehicle.width_m / 2
+    half_m = np.array([vehicle.length_m, vehicle.width_m])[:, None, None, None] / 2
     cos, sin = pose.heading_x[:, None], pose.heading_y[:, None]
     dx, dy = x_m - pose.x_m[:, None], y_m - pose.y_m[:, None]
-    # Both boxes are alike: seen from the ego the other is turned to one side, seen from the other the ego to the other
-    # side. In either view, (2, R, V), the viewed box's centre, and its corners (4, 2, R, V).
-    along = np.array([dx * cos + dy * sin, dx])
-    across = np.array([dy * cos - dx * sin, dy])
-    turn = np.array([-sin, sin])
-    corner_along = along + (_CORNERS[0] * half_length * cos - _CORNERS[1] * half_width * turn)
-    corner_across = across + (_CORNERS[0] * half_length * turn + _CORNERS[1] * half_width * cos)
-    outside_along = np.maximum(np.abs(corner_along) - half_length, 0.0)
-    outside_across = np.maximum(np.abs(corner_across) - half_width, 0.0)
-    # Disjoint convex polygons are closest at a corner of one of them.
-    gap = np.hypot(outside_along, outside_across).min(axis=(0, 1))
-    reach_along = half_length + half_length * np.abs(cos) + half_width * np.abs(sin)
-    reach_across = half_width + half_length * np.abs(sin) + half_width * np.abs(cos)
-    apart = ((np.abs(along) >= reach_along) | (np.abs(across) >= reach_across)).any(axis=0)
+    # Each pair in two views, the other as the ego has it ahead and abreast, and the ego as the other has it. Both boxes
+    # are alike, turned to one side and to the other. Axes: corner, (ahead, abreast), view, R, V.
+    centre = np.array([[dx * cos + dy * sin, dx], [dy * cos - dx * sin, dy]])
+    lengthwise = np.array([[cos, cos], [-sin, sin]])
+    crosswise = np.array([[sin, -sin], [cos, cos]])
+    corners = centre + _CORNERS[0] * half_m[0] * lengthwise + _CORNERS[1] * half_m[1] * crosswise
+    # Disjoint convex polygons are closest at a corner of one of them, and apart along a side of one of them.
+    outside = np.maximum(np.abs(corners) - half_m, 0.0)
+    gap = np.hypot(outside[:, 0], outside[:, 1]).min(axis=(0, 1))
+    apart = ((corners.min(axis=0) >= half_m) | (corners.max(axis=0) <= -half_m)).any(axis=(0, 1))
     return np.where(apart, gap, 0.0)

@@ -1,0 +1,66 @@
+"""The benchmark on tiny sizes: what it prints, not how fast anything is."""
+
+import json
+
+import pytest
+
+from tint_sumo.bench import Sizes, _Clocks, run_benchmark
+
+TINY = Sizes(replicas=4, turns=2, turn_steps=3, gym_turn_steps=5, windows=20, memory_env_steps=(12, 24))
+PARTS = {"sumo", "getters", "spawning", "claims", "safety_check", "observation", "adapter", "other"}
+
+
+@pytest.mark.slow
+def test_the_benchmark_measures_everything() -> None:
+    found = run_benchmark(TINY, progress=False)
+    printed = json.loads(json.dumps(found.to_json()))
+    assert printed.keys() == {
+        "floor_env_steps_per_s",
+        "env_steps_per_s",
+        "env_to_floor",
+        "gym_env_steps_per_s",
+        "cores",
+        "record_windows_per_s",
+        "peak_rss_mib",
+        "windows",
+        "memory_growth_mib",
+        "breakdown_us",
+    }
+    assert printed["cores"].keys() == {"one", "two", "ratio"}
+    assert printed["breakdown_us"].keys() == PARTS
+    speeds = [value for key, value in printed.items() if key.endswith("_per_s")]
+    assert min(speeds + list(printed["breakdown_us"].values()) + list(printed["cores"].values())) > 0.0
+    assert printed["windows"] >= 20
+    assert printed["peak_rss_mib"] > 50.0  # three Pythons
+    assert found.breakdown_us["sumo"] == pytest.approx(1e6 / found.floor_env_steps_per_s, rel=0.9)
+    table = found.table()
+    assert all(part in table for part in PARTS)
+    assert "clocks around the named functions" in table
+
+
+class Work:
+    """Spends time as a fake clock tells."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def outer(self) -> str:
+        self.now_s += 1.0
+        self.inner()
+        self.inner()
+        return "done"
+
+    def inner(self) -> None:
+        self.now_s += 10.0
+
+
+def test_time_in_a_watched_method_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    work = Work()
+    monkeypatch.setattr("time.perf_counter", lambda: work.now_s)
+    with _Clocks() as clocks:
+        clocks.watch(work, "outer", "outer")
+        clocks.watch(work, "inner", "inner")
+        assert work.outer() == "done"
+    assert (clocks.spent_s["outer"], clocks.spent_s["inner"]) == (1.0, 20.0)
+    work.outer()
+    assert clocks.spent_s["inner"] == 20.0  # no longer watched

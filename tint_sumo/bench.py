@@ -29,6 +29,7 @@ BREAKDOWN_METHOD = "clocks around the named functions in a pass of its own, thei
 
 _MIB = 2**20
 _WARM_UP_STEPS = 100  # of all replicas: their episodes begin together and drift apart
+_BARE_STEPS = 10  # of SUMO alone: one second, in which few vehicles leave and none would enter
 _RECORD_WORKERS = 2
 _SAMPLING_S = 0.05
 
@@ -59,7 +60,11 @@ class Cores:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What :func:`run_benchmark` found. A floor is the time spent in SUMO's ``simulationStep`` alone."""
+    """What :func:`run_benchmark` found.
+
+    The floor is SUMO's ``simulationStep`` alone, step after step with nothing in between, in the same simulation with
+    the same vehicles on the street.
+    """
 
     floor_env_steps_per_s: float
     env_steps_per_s: float
@@ -107,8 +112,8 @@ def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmar
 class _Driven:
     """A Stable-Baselines3 environment under random actions."""
 
-    def __init__(self, sizes: Sizes, workers: int = 1) -> None:
-        self.env = TIntersectionVecEnv(sizes.replicas, seed=0, workers=workers)
+    def __init__(self, sizes: Sizes, workers: int = 1, seed: int = 0) -> None:
+        self.env = TIntersectionVecEnv(sizes.replicas, seed=seed, workers=workers)
         self._actions = np.random.default_rng(0).integers(3, size=(sizes.turn_steps, sizes.replicas))
         self.env.reset()
         for _ in range(_WARM_UP_STEPS):
@@ -131,10 +136,18 @@ class _Driven:
         steps = self.turn()
         return steps / (time.perf_counter() - start)
 
+    def bare_steps_per_s(self) -> float:
+        """Steps of SUMO in a row; the environment loses track of its vehicles and is of no more use."""
+        step = self.batch.episodes.simulation._connection.step
+        start = time.perf_counter()
+        for _ in range(_BARE_STEPS):
+            step()
+        return _BARE_STEPS * self.env.num_envs / (time.perf_counter() - start)
+
 
 @contextmanager
-def _driven(sizes: Sizes, workers: int = 1) -> Iterator[_Driven]:
-    driven = _Driven(sizes, workers)
+def _driven(sizes: Sizes, workers: int = 1, seed: int = 0) -> Iterator[_Driven]:
+    driven = _Driven(sizes, workers, seed)
     try:
         yield driven
     finally:
@@ -142,14 +155,12 @@ def _driven(sizes: Sizes, workers: int = 1) -> Iterator[_Driven]:
 
 
 def _speed(sizes: Sizes) -> dict[str, Any]:
-    """In turns: the environment as it is, and the time it spends in simulationStep."""
+    """In turns: the environment as it is, and SUMO alone from the state it has reached."""
     env, floor = [], []
-    with _driven(sizes) as driven:
-        for _ in range(sizes.turns):
+    for turn in range(sizes.turns):
+        with _driven(sizes, seed=turn) as driven:
             env.append(driven.steps_per_s())
-            with _Clocks() as clocks:
-                clocks.watch_sumo(driven.batch)
-                floor.append(driven.turn() / clocks.spent_s["sumo"])
+            floor.append(driven.bare_steps_per_s())
     return {
         "floor_env_steps_per_s": median(floor),
         "env_steps_per_s": median(env),
@@ -158,9 +169,12 @@ def _speed(sizes: Sizes) -> dict[str, Any]:
 
 
 def _breakdown(sizes: Sizes) -> dict[str, Any]:
-    with _driven(sizes) as driven, _Clocks() as clocks:
-        simulation, episodes = driven.batch.episodes.simulation, driven.batch.episodes
-        clocks.watch_sumo(driven.batch)
+    with _driven(sizes) as driven:
+        episodes, simulation = driven.batch.episodes, driven.batch.episodes.simulation
+        clocks = _Clocks()
+        simulation._connection = replace(
+            simulation._connection, step=clocks.around(simulation._connection.step, "sumo")
+        )
         clocks.watch(simulation, "_read_positions", "getters")
         clocks.watch(simulation, "_admit", "spawning")
         clocks.watch(simulation, "reset", "spawning")
@@ -176,44 +190,29 @@ def _breakdown(sizes: Sizes) -> dict[str, Any]:
 
 
 class _Clocks:
-    """Clocks around methods; what is spent in a watched method within another one counts for the inner one alone."""
+    """Clocks around functions; what is spent in one within another one counts for the inner one alone."""
 
     def __init__(self) -> None:
         self.spent_s: dict[str, float] = {}
-        self._within_s = [0.0]  # spent in watched methods, at every depth of calls
+        self._within_s = [0.0]  # spent in clocked functions, at every depth of calls
         self._cost_s = 0.0
-        self._watched: list[tuple[Any, str, Any]] = []
-        idle = self._clock(lambda: None, "idle")
+        idle = self.around(lambda: None, "idle")
         start = time.perf_counter()
         for _ in range(1000):
             idle()
         self._cost_s = (time.perf_counter() - start) / 1000
 
-    def __enter__(self) -> "_Clocks":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for owner, name, method in reversed(self._watched):
-            object.__setattr__(owner, name, method)
-
-    def watch_sumo(self, batch: LocalBatch) -> None:
-        simulation = batch.episodes.simulation
-        connection = simulation._connection
-        self._watched.append((simulation, "_connection", connection))
-        simulation._connection = replace(connection, step=self._clock(connection.step, "sumo"))
-
     def watch(self, owner: object, name: str, part: str) -> None:
-        method = getattr(owner, name)
-        self._watched.append((owner, name, method))
-        setattr(owner, name, self._clock(method, part))
+        """Put a clock around a method for good."""
+        setattr(owner, name, self.around(getattr(owner, name), part))
 
-    def _clock(self, method: Callable[..., Any], part: str) -> Callable[..., Any]:
+    def around(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
         self.spent_s.setdefault(part, 0.0)
 
         def clocked(*args: Any, **kwargs: Any) -> Any:
             self._within_s.append(0.0)
             start = time.perf_counter()
-            result = method(*args, **kwargs)
+            result = function(*args, **kwargs)
             elapsed_s = time.perf_counter() - start
             self.spent_s[part] += elapsed_s - self._within_s.pop()
             self._within_s[-1] += elapsed_s + self._cost_s

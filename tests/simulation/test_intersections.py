@@ -9,6 +9,7 @@ from tests.simulation.scenes import GO, STEP_S, scene
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, MAX_VEHICLES, EgoController, Idm, Population, Scenario, Traffic
 from tint_sumo.errors import InputError
 from tint_sumo.scenario.geometry import LANE_DIRECTION, LOWER, UPPER, box_distance_m
+from tint_sumo.simulation.ego import is_unsafe
 from tint_sumo.simulation.intersections import Intersections, PlacedVehicle
 
 STATE = ("present", "lane", "front_m", "member", "vehicle_number", "ego_front_m", "ego_speed_mps", "has_claimed")
@@ -263,6 +264,33 @@ def test_sumo_reports_a_collision_just_when_the_boxes_overlap() -> None:
                     simulation.reset(replica, [4, replica, step])
         assert collisions > 60
         assert lag <= 0.02 * collisions  # a grazing contact may be seen one step late
+    finally:
+        simulation.close()
+
+
+def test_the_safety_check_misses_no_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It looks only at vehicles nearby; all of them, looked at one by one, say the same."""
+    replicas = 20
+    simulation = Intersections(replicas)
+    check, found = simulation._check_safety, []
+    monkeypatch.setattr(simulation, "_check_safety", lambda: found.append(check()) or found[-1])
+    try:
+        for replica in range(replicas):
+            simulation.reset(replica, [6, replica])
+        rng = np.random.default_rng(6)
+        before_m = np.full((replicas, MAX_VEHICLES), np.inf)
+        for step in range(300):
+            now_m = ego_distances_m(simulation)
+            known = np.isfinite(before_m) & np.isfinite(now_m)
+            approach_m = np.subtract(before_m, now_m, out=np.zeros_like(now_m), where=known)
+            simulation.step(rng.choice(DESIRED_MPS, replicas) if step % 20 else np.full(replicas, GO))
+            expected = is_unsafe(now_m, approach_m / STEP_S, simulation.scenario.ego).any(axis=1)
+            np.testing.assert_array_equal(found[-1], expected)
+            before_m = now_m
+            for replica in np.flatnonzero(simulation.collided | (simulation.ego_pose().x_m > 8.0)).tolist():
+                simulation.reset(replica, [6, replica, step])
+                before_m[replica] = np.inf
+        assert 0.1 < np.mean(found) < 0.9
     finally:
         simulation.close()
 

@@ -5,8 +5,11 @@ import json
 import pytest
 
 from tint_sumo.bench import Sizes, _Clocks, run_benchmark
+from tint_sumo.traits import METHODS
 
-TINY = Sizes(replicas=4, turns=2, turn_steps=3, gym_turn_steps=5, windows=20, memory_env_steps=(12, 24))
+TINY = Sizes(
+    replicas=4, turns=2, turn_steps=3, gym_turn_steps=5, windows=20, training_windows=50, memory_env_steps=(12, 24)
+)
 PARTS = {"sumo", "getters", "spawning", "claims", "safety_check", "observation", "adapter", "other"}
 
 
@@ -18,18 +21,25 @@ def test_the_benchmark_measures_everything() -> None:
         "floor_env_steps_per_s",
         "env_steps_per_s",
         "env_to_floor",
+        "checking_floor_env_steps_per_s",
+        "env_to_checking_floor",
         "gym_env_steps_per_s",
         "cores",
         "record_windows_per_s",
         "peak_rss_mib",
         "windows",
         "memory_growth_mib",
+        "train_windows_per_s",
+        "encode_ms",
         "breakdown_us",
     }
     assert printed["cores"].keys() == {"one", "two", "ratio"}
     assert printed["breakdown_us"].keys() == PARTS
     speeds = [value for key, value in printed.items() if key.endswith("_per_s")]
     assert min(speeds + list(printed["breakdown_us"].values()) + list(printed["cores"].values())) > 0.0
+    for part in ("train_windows_per_s", "encode_ms"):
+        assert printed[part].keys() == METHODS.keys()
+        assert min(printed[part].values()) > 0.0
     assert printed["windows"] >= 20
     assert printed["peak_rss_mib"] > 50.0  # three Pythons
     table = found.table()

@@ -65,9 +65,10 @@ def test_floors_import_downwards_only() -> None:
         "scenario",
         "simulation",
         "envs dataset",
-        "traits bench",
+        "traits",
         "policy",
         "study",
+        "bench",
         "cli",
     ]
     floor_of = {name: level for level, names in enumerate(floors) for name in names.split()}

@@ -1,4 +1,4 @@
-"""How fast the environments and the recorder are, measured against SUMO's own speed (``tint-sumo bench``).
+"""How fast environments, recorder and trait models are, measured against SUMO's own speed (``tint-sumo bench``).
 
 Whatever is compared is measured in turns within one run, since other work on a machine slows all of it down; what
 comes out is the median of the turns.
@@ -19,11 +19,18 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from tqdm import tqdm
+import torch
 
 from tint_sumo import ENV_ID
+from tint_sumo.config import MAX_VEHICLES, WINDOW_STEPS
+from tint_sumo.dataset.windows import Windows
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.progress import make_bar
+from tint_sumo.simulation.intersections import SUMO_COLLISION_CHECK, Intersections
+from tint_sumo.study.budgets import TRAIT_BUDGETS
+from tint_sumo.traits import METHODS
+from tint_sumo.traits.training import train
 
 BREAKDOWN_METHOD = "clocks around the named functions in a pass of its own, their own cost subtracted"
 
@@ -32,6 +39,7 @@ _WARM_UP_STEPS = 100  # of all replicas: their episodes begin together and drift
 _BARE_STEPS = 10  # of SUMO alone: one second, in which few vehicles leave and none would enter
 _RECORD_WORKERS = 2
 _SAMPLING_S = 0.05
+_ENCODED = 64 * MAX_VEHICLES
 
 
 @dataclass(frozen=True)
@@ -43,10 +51,18 @@ class Sizes:
     turn_steps: int = 100
     gym_turn_steps: int = 1_000  # of the single environment
     windows: int = 100_000
+    training_windows: int = 40_000
     memory_env_steps: tuple[int, int] = (100_000, 2_000_000)  # of single intersections: growth from, growth to
 
 
-QUICK = Sizes(turns=3, turn_steps=50, gym_turn_steps=500, windows=10_000, memory_env_steps=(20_000, 100_000))
+QUICK = Sizes(
+    turns=3,
+    turn_steps=50,
+    gym_turn_steps=500,
+    windows=10_000,
+    training_windows=5_000,
+    memory_env_steps=(20_000, 100_000),
+)
 
 
 @dataclass(frozen=True)
@@ -63,18 +79,23 @@ class Benchmark:
     """What :func:`run_benchmark` found.
 
     The floor is SUMO's ``simulationStep`` alone, step after step with nothing in between, in the same simulation with
-    the same vehicles on the street.
+    the same vehicles on the street. It does less than the environment, which sees collisions where the simulation is
+    told not to look for them; the checking floor is SUMO alone in such traffic when it looks for them itself.
     """
 
     floor_env_steps_per_s: float
     env_steps_per_s: float
     env_to_floor: float
+    checking_floor_env_steps_per_s: float
+    env_to_checking_floor: float
     gym_env_steps_per_s: float
     cores: Cores
     record_windows_per_s: float
     peak_rss_mib: float  # of the recorder's processes together
     windows: int
     memory_growth_mib: float
+    train_windows_per_s: dict[str, float]  # by trait method, with one thread
+    encode_ms: dict[str, float]  # the same, of all 12 slots of 64 intersections
     breakdown_us: dict[str, float]  # per environment step
 
     def to_json(self) -> dict[str, Any]:
@@ -84,8 +105,10 @@ class Benchmark:
         total_us = sum(self.breakdown_us.values())
         rows = [
             ("SUMO's simulationStep alone", f"{self.floor_env_steps_per_s:,.0f} environment steps/s"),
+            ("  looking for collisions, too", f"{self.checking_floor_env_steps_per_s:,.0f} environment steps/s"),
             ("Stable-Baselines3 environment", f"{self.env_steps_per_s:,.0f} environment steps/s"),
             ("  its speed to SUMO's alone", f"{self.env_to_floor:.2f}"),
+            ("  and with its collision check", f"{self.env_to_checking_floor:.2f}"),
             ("one gymnasium environment", f"{self.gym_env_steps_per_s:,.0f} steps/s"),
             ("one process", f"{self.cores.one:,.0f} environment steps/s"),
             ("two workers", f"{self.cores.two:,.0f} environment steps/s"),
@@ -93,6 +116,11 @@ class Benchmark:
             (f"recorder, {_RECORD_WORKERS} workers", f"{self.record_windows_per_s:,.0f} windows/s"),
             ("  its processes' peak memory", f"{self.peak_rss_mib:,.0f} MiB"),
             ("memory growth while stepping", f"{self.memory_growth_mib:+.1f} MiB"),
+            *((f"training {method}", f"{speed:,.0f} windows/s") for method, speed in self.train_windows_per_s.items()),
+            *(
+                (f"encoding {_ENCODED} windows, {method}", f"{one_ms:.2f} ms")
+                for method, one_ms in self.encode_ms.items()
+            ),
             ("where an environment step's time goes", f"{total_us:.1f} us"),
             *((f"  {part}", f"{us:.1f} us  {us / total_us:4.0%}") for part, us in self.breakdown_us.items()),
         ]
@@ -102,9 +130,9 @@ class Benchmark:
 def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmark:
     """Measure everything, one after the other."""
     sizes = sizes or Sizes()
-    measurements = (_speed, _breakdown, _gym_speed, _cores, _record, _memory)
+    measurements = (_speed, _breakdown, _gym_speed, _cores, _record, _memory, _traits)
     found: dict[str, Any] = {}
-    for measurement in tqdm(measurements, desc="bench", unit="measurement", disable=not progress):
+    for measurement in make_bar(iterable=measurements, desc="bench", unit="measurement", disable=not progress):
         found |= measurement(sizes)
     return Benchmark(**found)
 
@@ -136,14 +164,6 @@ class _Driven:
         steps = self.turn()
         return steps / (time.perf_counter() - start)
 
-    def bare_steps_per_s(self) -> float:
-        """Steps of SUMO in a row; the environment loses track of its vehicles and is of no more use."""
-        step = self.batch.episodes.simulation._connection.step
-        start = time.perf_counter()
-        for _ in range(_BARE_STEPS):
-            step()
-        return _BARE_STEPS * self.env.num_envs / (time.perf_counter() - start)
-
 
 @contextmanager
 def _driven(sizes: Sizes, workers: int = 1, seed: int = 0) -> Iterator[_Driven]:
@@ -155,17 +175,46 @@ def _driven(sizes: Sizes, workers: int = 1, seed: int = 0) -> Iterator[_Driven]:
 
 
 def _speed(sizes: Sizes) -> dict[str, Any]:
-    """In turns: the environment as it is, and SUMO alone from the state it has reached."""
-    env, floor = [], []
+    """In turns: the environment as it is, SUMO alone from the state it has reached, and SUMO with collision checks."""
+    env, floor, checking = [], [], []
     for turn in range(sizes.turns):
         with _driven(sizes, seed=turn) as driven:
             env.append(driven.steps_per_s())
-            floor.append(driven.bare_steps_per_s())
+            floor.append(_bare_steps_per_s(driven.batch.episodes.simulation))
+        checking.append(_checking_steps_per_s(sizes, seed=turn))
     return {
         "floor_env_steps_per_s": median(floor),
         "env_steps_per_s": median(env),
         "env_to_floor": median(a / b for a, b in zip(env, floor, strict=True)),
+        "checking_floor_env_steps_per_s": median(checking),
+        "env_to_checking_floor": median(a / b for a, b in zip(env, checking, strict=True)),
     }
+
+
+def _bare_steps_per_s(simulation: Intersections) -> float:
+    """Steps of SUMO in a row; the simulation loses track of its vehicles and is of no more use."""
+    step = simulation._connection.step
+    start = time.perf_counter()
+    for _ in range(_BARE_STEPS):
+        step()
+    return _BARE_STEPS * simulation.replicas / (time.perf_counter() - start)
+
+
+def _checking_steps_per_s(sizes: Sizes, seed: int) -> float:
+    """The same of a simulation that SUMO checks for collisions, after as many steps of random egos."""
+    rng = np.random.default_rng(seed)
+    simulation = Intersections(sizes.replicas, collision_options=SUMO_COLLISION_CHECK)
+    scenario = simulation.scenario
+    try:
+        over = np.ones(sizes.replicas, bool)
+        for step in range(_WARM_UP_STEPS + sizes.turn_steps):
+            for replica in np.flatnonzero(over).tolist():
+                simulation.reset(replica, [seed, replica, step])
+            simulation.step(rng.choice(scenario.ego.desired_speeds_mps, sizes.replicas))
+            over = simulation.collided | (simulation.ego_pose().x_m > scenario.episode.goal_x_m)
+        return _bare_steps_per_s(simulation)
+    finally:
+        simulation.close()
 
 
 def _breakdown(sizes: Sizes) -> dict[str, Any]:
@@ -179,9 +228,9 @@ def _breakdown(sizes: Sizes) -> dict[str, Any]:
         clocks.watch(simulation, "_admit", "spawning")
         clocks.watch(simulation, "reset", "spawning")
         clocks.watch(simulation, "_update_claims", "claims")
-        clocks.watch(simulation, "_check_safety", "safety_check")
+        clocks.watch(simulation, "_measure_distances", "safety_check")
         clocks.watch(driven.batch, "_state", "observation")
-        clocks.watch(episodes, "step", "other")  # driving the egos, collisions, rewards
+        clocks.watch(episodes, "step", "other")  # driving the egos, rewards
         clocks.watch(driven.batch, "step", "other")
         clocks.watch(driven.env, "step", "adapter")
         steps = sum(driven.turn() for _ in range(sizes.turns))
@@ -275,6 +324,62 @@ def _memory(sizes: Sizes) -> dict[str, Any]:
                 steps += driven.turn()
             sizes_mib.append(_rss_mib("self"))
     return {"memory_growth_mib": sizes_mib[1] - sizes_mib[0]}
+
+
+def _traits(sizes: Sizes) -> dict[str, Any]:
+    """Each trait method with the sizes of the full budget and one thread of torch, as in the study's jobs."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        training = {method: _train_windows_per_s(method, sizes.training_windows) for method in METHODS}
+        encoding = {method: _encode_ms(method, sizes.turns) for method in METHODS}
+    finally:
+        torch.set_num_threads(threads)
+    return {"train_windows_per_s": training, "encode_ms": encoding}
+
+
+def _train_windows_per_s(method: str, windows: int) -> float:
+    labels = np.arange(windows) % 2 == 0 if METHODS[method].uses_labels else None
+    data = _steady_windows(windows)
+    with tempfile.TemporaryDirectory(prefix="tint_sumo.") as folder:
+        start = time.perf_counter()
+        train(
+            data,
+            replace(TRAIT_BUDGETS["full"], epochs=1),
+            Path(folder),
+            method=method,
+            conservative=labels,
+            progress=False,
+        )
+        return windows / (time.perf_counter() - start)
+
+
+def _encode_ms(method: str, turns: int) -> float:
+    model = METHODS[method](TRAIT_BUDGETS["full"]).eval()
+    data = _steady_windows(_ENCODED)
+    states, length = torch.from_numpy(data.states), torch.from_numpy(data.length)
+    elapsed_ms = []
+    with torch.inference_mode():
+        for _ in range(10 * turns):
+            start = time.perf_counter()
+            model.encode(states, length)
+            elapsed_ms.append(1e3 * (time.perf_counter() - start))
+    return median(elapsed_ms)
+
+
+def _steady_windows(windows: int) -> Windows:
+    """Full windows of drivers at a steady speed; what stands in windows does not change how long they take."""
+    rng = np.random.default_rng(0)
+    offset_m = rng.uniform(0.2, 0.3, (windows, 1)) * np.arange(WINDOW_STEPS)
+    gap_m = np.broadcast_to(rng.uniform(3.0, 20.0, (windows, 1)), offset_m.shape)
+    number = np.arange(windows)
+    return Windows(
+        np.stack((offset_m, gap_m), axis=2).astype(np.float32),
+        np.full(windows, WINDOW_STEPS),
+        number // 8,
+        number // 400,
+        np.ones(windows, bool),
+    )
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -10,7 +10,12 @@ from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, MAX_VEHICLES, EgoControll
 from tint_sumo.errors import InputError
 from tint_sumo.scenario.geometry import LANE_DIRECTION, LOWER, UPPER, box_distance_m
 from tint_sumo.simulation.ego import is_unsafe
-from tint_sumo.simulation.intersections import Intersections, PlacedVehicle
+from tint_sumo.simulation.intersections import (
+    NO_COLLISION_CHECK,
+    SUMO_COLLISION_CHECK,
+    Intersections,
+    PlacedVehicle,
+)
 
 STATE = ("present", "lane", "front_m", "member", "vehicle_number", "ego_front_m", "ego_speed_mps", "has_claimed")
 DESIRED_MPS = np.array([0.0, 0.5, 3.0])
@@ -243,49 +248,91 @@ def ego_distances_m(simulation: Intersections) -> Any:
     return np.where(simulation.present, distance_m, np.inf)
 
 
-def test_sumo_reports_a_collision_just_when_the_boxes_overlap() -> None:
+def careless(replicas: int, collision_options: Sequence[str]) -> Intersections:
+    """Egos without a safety check among drivers who mostly do not yield."""
+    ego = EgoController(unsafe_distance_m=0.0, closing_distance_m=0.0)
+    scenario = Scenario(traffic=Traffic(p_conservative=0.2), ego=ego)
+    simulation = Intersections(replicas, scenario, collision_options=collision_options)
+    for replica in range(replicas):
+        simulation.reset(replica, [3, replica])
+    return simulation
+
+
+def hits_by_sumo(simulation: Intersections) -> dict[int, int]:
+    """Replica to slot of the vehicles that SUMO says collide with an ego now."""
+    hits = {}
+    for event in simulation._connection.simulation.getCollisions():
+        pair = {event.collider, event.victim}
+        for vehicle_id in pair & simulation._index.keys():
+            if pair - {vehicle_id} <= set(simulation._ego_ids):
+                replica, slot = divmod(simulation._index[vehicle_id], MAX_VEHICLES)
+                hits.setdefault(replica, slot)
+    return hits
+
+
+def test_collisions_are_those_that_sumo_sees() -> None:
     replicas = 40
-    careless = EgoController(unsafe_distance_m=0.0, closing_distance_m=0.0)
-    simulation = Intersections(replicas, Scenario(traffic=Traffic(p_conservative=0.2), ego=careless))
+    simulation = careless(replicas, SUMO_COLLISION_CHECK)
     try:
-        for replica in range(replicas):
-            simulation.reset(replica, [3, replica])
         rng = np.random.default_rng(3)
-        collisions = lag = 0
+        seen: dict[int, int] = {}  # replica to the step of its collision
+        at_once = late = 0
         for step in range(300):
-            overlapped = (ego_distances_m(simulation) == 0.0).any(axis=1)
             simulation.step(rng.choice(DESIRED_MPS, replicas) if step % 20 else np.full(replicas, GO))
-            overlaps = (ego_distances_m(simulation) <= 1e-3).any(axis=1)
-            for replica in range(replicas):
-                if simulation.collision[replica] is not None:
-                    assert overlaps[replica]
-                    lag += int(overlapped[replica])
-                    collisions += 1
+            hits = hits_by_sumo(simulation)
+            assert all(simulation.collided[replica] for replica in hits)  # none that SUMO alone sees
+            for replica in np.flatnonzero(simulation.collided).tolist():
+                collision = simulation.collision[replica]
+                assert collision is not None
+                seen.setdefault(replica, step)
+                if replica in hits:
+                    assert hits[replica] == collision.slot
+                    at_once += seen[replica] == step
+                    late += seen[replica] < step
+                    del seen[replica]
                     simulation.reset(replica, [4, replica, step])
-        assert collisions > 60
-        assert lag <= 0.02 * collisions  # a grazing contact may be seen one step late
+            assert all(step - since < 2 for since in seen.values())  # SUMO sees each of them a step later at most
+        assert at_once > 60
+        assert late <= 0.02 * at_once  # a grazing contact
     finally:
         simulation.close()
 
 
-def test_the_safety_check_misses_no_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_traffic_is_the_same_whether_or_not_sumo_looks_for_collisions() -> None:
+    def run(collision_options: Sequence[str]) -> list[np.ndarray]:
+        simulation = careless(10, collision_options)
+        rng, states = np.random.default_rng(5), []
+        try:
+            for step in range(200):
+                simulation.step(rng.choice(DESIRED_MPS, 10) if step % 20 else np.full(10, GO))
+                states += [np.array(getattr(simulation, key)) for key in (*STATE, "collided")]
+                for replica in np.flatnonzero(simulation.collided).tolist():
+                    simulation.reset(replica, [6, replica, step])
+        finally:
+            simulation.close()
+        return states
+
+    for one, other in zip(run(NO_COLLISION_CHECK), run(SUMO_COLLISION_CHECK), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_the_safety_check_misses_no_vehicle() -> None:
     """It looks only at vehicles nearby; all of them, looked at one by one, say the same."""
     replicas = 20
     simulation = Intersections(replicas)
-    check, found = simulation._check_safety, []
-    monkeypatch.setattr(simulation, "_check_safety", lambda: found.append(check()) or found[-1])
     try:
         for replica in range(replicas):
             simulation.reset(replica, [6, replica])
         rng = np.random.default_rng(6)
-        before_m = np.full((replicas, MAX_VEHICLES), np.inf)
+        found, before_m = [], np.full((replicas, MAX_VEHICLES), np.inf)
         for step in range(300):
             now_m = ego_distances_m(simulation)
             known = np.isfinite(before_m) & np.isfinite(now_m)
             approach_m = np.subtract(before_m, now_m, out=np.zeros_like(now_m), where=known)
-            simulation.step(rng.choice(DESIRED_MPS, replicas) if step % 20 else np.full(replicas, GO))
+            found.append(simulation._unsafe.copy())
             expected = is_unsafe(now_m, approach_m / STEP_S, simulation.scenario.ego).any(axis=1)
             np.testing.assert_array_equal(found[-1], expected)
+            simulation.step(rng.choice(DESIRED_MPS, replicas) if step % 20 else np.full(replicas, GO))
             before_m = now_m
             for replica in np.flatnonzero(simulation.collided | (simulation.ego_pose().x_m > 8.0)).tolist():
                 simulation.reset(replica, [6, replica, step])

@@ -66,14 +66,22 @@ class PlacedVehicle:
     member: int  # index into the population
 
 
-def _sumo_options(folder: Path, step_s: float) -> list[str]:
+# SUMO need not look for collisions: the distances of the safety check show them, at the same step and with the same
+# vehicle, and SUMO's check on junctions costs more than all the rest of its step once egos stand among the traffic.
+NO_COLLISION_CHECK = ("--collision.action", "none")
+SUMO_COLLISION_CHECK = (
+    *("--collision.action", "warn"),
+    *("--collision.check-junctions", "true"),
+    *("--collision.mingap-factor", "0"),
+)
+
+
+def _sumo_options(folder: Path, step_s: float, collision_options: Sequence[str]) -> list[str]:
     return [
         *("--net-file", str(folder / NET_FILE)),
         *("--additional-files", f"{folder / DRIVERS_FILE},{folder / ROUTES_FILE}"),
         *("--step-length", str(step_s)),
-        *("--collision.action", "warn"),
-        *("--collision.check-junctions", "true"),
-        *("--collision.mingap-factor", "0"),
+        *collision_options,
         *("--time-to-teleport", "-1"),
         *("--no-step-log", "true"),
         *("--no-warnings", "true"),
@@ -81,11 +89,11 @@ def _sumo_options(folder: Path, step_s: float) -> list[str]:
     ]
 
 
-def _start(replicas: int, scenario: Scenario, backend: Backend) -> Connection:
+def _start(replicas: int, scenario: Scenario, backend: Backend, collision_options: Sequence[str]) -> Connection:
     with tempfile.TemporaryDirectory(prefix="tint_sumo.") as folder:
         for file, text in scenario_files(replicas, scenario, spacing_m=0.0).items():
             (Path(folder) / file).write_text(text, encoding="utf-8")
-        return connect(_sumo_options(Path(folder), scenario.episode.step_s), backend)
+        return connect(_sumo_options(Path(folder), scenario.episode.step_s, collision_options), backend)
 
 
 def _where(mask: Bools) -> Iterator[tuple[int, int]]:
@@ -118,7 +126,13 @@ class Intersections:
     """
 
     def __init__(
-        self, replicas: int, scenario: Scenario | None = None, *, with_ego: bool = True, backend: Backend = "auto"
+        self,
+        replicas: int,
+        scenario: Scenario | None = None,
+        *,
+        with_ego: bool = True,
+        backend: Backend = "auto",
+        collision_options: Sequence[str] = NO_COLLISION_CHECK,
     ) -> None:
         self.scenario = scenario = scenario or Scenario()
         self.replicas = replicas
@@ -154,7 +168,8 @@ class Intersections:
         self._lane_pos_m: Floats = np.zeros(replicas * MAX_VEHICLES)
         self._last_slot = np.full((replicas, 2), _EMPTY)  # of the vehicle that entered each lane last
         self._was_present: Bools = np.zeros(slots, bool)  # at the previous step; such a slot takes no new vehicle yet
-        self._distance_m: Floats = np.full(slots, np.inf)  # from the ego, before its last move; infinite if far
+        self._distance_m: Floats = np.full(slots, np.inf)  # from the ego; infinite if far
+        self._unsafe: Bools = np.zeros(replicas, bool)  # what the safety check says for the next step
         self._claims: Bools = np.zeros((replicas, 2), bool)
         self._ids: list[list[str]] = [[""] * MAX_VEHICLES for _ in range(replicas)]
         self._ego_ids = [""] * replicas
@@ -164,7 +179,7 @@ class Intersections:
         self._wanted_gap_m: Floats = np.full((replicas, 2), np.inf)
         self._wanted_time_s: Floats = np.zeros((replicas, 2))
 
-        self._connection = _start(replicas, scenario, backend)
+        self._connection = _start(replicas, scenario, backend, collision_options)
         self._finalizer = weakref.finalize(self, self._connection.close)
 
     @property
@@ -238,6 +253,7 @@ class Intersections:
         self._was_present[replica] = False
         self._wanted_gap_m[replica] = np.inf
         self._distance_m[replica] = np.inf
+        self._unsafe[replica] = False
 
     def _add_ego(self, replica: int) -> None:
         ego_id = f"{_EGO_PREFIX}.{replica}.{self._episodes[replica]}"
@@ -313,14 +329,14 @@ class Intersections:
             elif vehicle_id in self._ego_ids:
                 self._ego_ids[self._ego_ids.index(vehicle_id)] = ""
         self._read_positions()
-        self._admit()
         if self._with_ego:
-            self._latch_collisions()
+            self._measure_distances()
+        self._admit()
 
     def _drive_egos(self, desired_speed_mps: Floats) -> None:
         controller, step_s = self.scenario.ego, self.scenario.episode.step_s
         self._update_claims()
-        accel = ego_control.acceleration_mps2(self.ego_speed_mps, desired_speed_mps, self._check_safety(), controller)
+        accel = ego_control.acceleration_mps2(self.ego_speed_mps, desired_speed_mps, self._unsafe, controller)
         self.ego_speed_mps = np.maximum(self.ego_speed_mps + accel * step_s, 0.0)
         self.ego_front_m = self.ego_front_m + self.ego_speed_mps * step_s
         self._pose = None
@@ -329,23 +345,37 @@ class Intersections:
             if ego_id:
                 set_speed(ego_id, speed_mps)
 
-    def _check_safety(self) -> Bools:
-        """Run the safety check on the vehicles within its reach and a margin for the next step; (R,)."""
+    def _measure_distances(self) -> None:
+        """Run the safety check for the next step, and latch collisions, on vehicles within reach of the check."""
         controller, shape, pose = self.scenario.ego, self.scenario.vehicle, self.ego_pose()
         is_near = self.present & (np.abs(self.x_m - pose.x_m[:, None]) < self._watch_x_m)
         is_near &= np.abs(self.y_m - pose.y_m[:, None]) < self._watch_y_m
         near = np.nonzero(is_near)
         before_m = self._distance_m[near]
         self._distance_m.fill(np.inf)
-        unsafe = np.zeros(self.replicas, bool)
+        self._unsafe.fill(False)
         if len(near[0]):
             at = (near[0], near[1], None)
             distance_m = box_distance_m(pose.of(near[0]), self.x_m[at], self.y_m[at], shape)[:, 0]
             approach_m = np.where(np.isfinite(before_m), before_m, distance_m) - distance_m
             self._distance_m[near] = distance_m
             is_unsafe = ego_control.is_unsafe(distance_m, approach_m / self.scenario.episode.step_s, controller)
-            unsafe[near[0][is_unsafe]] = True
-        return unsafe
+            self._unsafe[near[0][is_unsafe]] = True
+            for hit in np.flatnonzero(distance_m == 0.0):
+                self._latch_collision(int(near[0][hit]), int(near[1][hit]))
+
+    def _latch_collision(self, replica: int, slot: int) -> None:
+        if self.collided[replica]:
+            return
+        pose = self.ego_pose()
+        self.collided[replica] = True
+        self.collision[replica] = Collision(
+            slot,
+            self.population[self.member[replica, slot]].profile.name,
+            LANE_NAMES[self.lane[replica, slot]],
+            float(pose.x_m[replica]),
+            float(pose.y_m[replica]),
+        )
 
     def _update_claims(self) -> None:
         pose = self.ego_pose()
@@ -394,22 +424,3 @@ class Intersections:
         upcoming = self._streams[replica][lane].upcoming
         self._wanted_gap_m[replica, lane] = upcoming.gap_m
         self._wanted_time_s[replica, lane] = self.time_s[replica] + upcoming.wait_s
-
-    def _latch_collisions(self) -> None:
-        for event in self._connection.simulation.getCollisions():
-            pair = (event.collider, event.victim)
-            ego_id = next((one for one in pair if one.startswith(_EGO_PREFIX)), None)
-            other = next((one for one in pair if one in self._index), None)
-            if ego_id is None or other is None:
-                continue
-            replica, slot = divmod(self._index[other], MAX_VEHICLES)
-            if self.collision[replica] is None and self._ego_ids[replica] == ego_id:
-                pose = self.ego_pose()
-                self.collided[replica] = True
-                self.collision[replica] = Collision(
-                    slot,
-                    self.population[self.member[replica, slot]].profile.name,
-                    LANE_NAMES[self.lane[replica, slot]],
-                    float(pose.x_m[replica]),
-                    float(pose.y_m[replica]),
-                )

@@ -25,8 +25,9 @@ class DriverPool:
     def __init__(self, population: tuple[DriverMember, ...], scenario: Scenario) -> None:
         self.population = population
         self.scenario = scenario
-        self.by_trait = {
-            yields: [index for index, member in enumerate(population) if member.profile.yields is yields]
+        everybody = list(range(len(population)))
+        self.by_trait = {  # where all are alike, each share is drawn from all
+            yields: [index for index in everybody if population[index].profile.yields is yields] or everybody
             for yields in (True, False)
         }
         self.mean_gap_m = float(np.mean([gap for member in population for gap in member.profile.entry_gap_m]))

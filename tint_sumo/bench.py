@@ -132,8 +132,10 @@ def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmar
     sizes = sizes or Sizes()
     measurements = (_speed, _breakdown, _gym_speed, _cores, _record, _memory, _traits)
     found: dict[str, Any] = {}
-    for measurement in make_bar(iterable=measurements, desc="bench", unit="measurement", disable=not progress):
-        found |= measurement(sizes)
+    with make_bar(total=len(measurements), desc="bench", unit="measurement", disable=not progress) as bar:
+        for measurement in measurements:
+            found |= measurement(sizes)
+            bar.update()
     return Benchmark(**found)
 
 

@@ -67,23 +67,21 @@ class TraitModel(nn.Module, ABC):
 
     def fit_features(self, states: Tensor, length: Tensor) -> None:
         """Set the scaling from training windows."""
-        raw, known = self.raw_features(states).double(), self._known(states, length)
-        for feature, spread in enumerate(self.feature_spread):
-            values = raw[..., feature][known[..., feature]]
+        raw, valid = self.raw_features(states).double(), valid_steps(states, length)
+        for feature, (spread, undefined) in enumerate(zip(self.feature_spread, self.undefined_steps, strict=True)):
+            values = raw[:, undefined:, feature][valid[:, undefined:]]
             std = values.std(correction=0) if len(values) else torch.zeros(())
             self.feature_mean[feature] = values.mean() if len(values) else 0.0
             self.feature_scale[feature] = (std if std >= SMALLEST_STD else 1.0) / spread
 
     def features(self, states: Tensor, length: Tensor) -> Tensor:
         """Scaled features (N, T, F), zero after ``length`` and where they are unknown."""
-        scaled = (self.raw_features(states) - self.feature_mean) / self.feature_scale
-        return torch.where(self._known(states, length), scaled, 0.0)
-
-    def _known(self, states: Tensor, length: Tensor) -> Tensor:
-        """(N, T, F): the valid steps at which a feature is known."""
-        step = torch.arange(states.shape[1], device=states.device).unsqueeze(-1)
-        since = step >= torch.tensor(self.undefined_steps, device=states.device)
-        return valid_steps(states, length).unsqueeze(-1) & since
+        gain = 1.0 / self.feature_scale
+        scaled = torch.addcmul(-self.feature_mean * gain, self.raw_features(states), gain)
+        features = torch.where(valid_steps(states, length).unsqueeze(-1), scaled, 0.0)
+        for feature, steps in enumerate(self.undefined_steps):
+            features[:, :steps, feature] = 0.0
+        return features
 
 
 def displacement_and_gap(states: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Table and figure of the comparison of trait methods, from the results of its jobs."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +68,7 @@ def _flat(content: dict[str, Any]) -> dict[str, Any]:
     for group in ("by_length", "by_leader"):
         for part, found in content.get(group, {}).items():
             value = found["accuracy"]
-            row[f"svc_{part.replace('-', '_to_')}_percent"] = None if value is None else 100.0 * value
+            row[f"svc_{part.replace('-', '_to_')}_percent"] = math.nan if value is None else 100.0 * value
     row |= {f"svc_P{p}_percent": 100.0 * value for p, value in content.get("by_p", {}).items()}
     return row | {f"r2_{name}": value for name, value in content.get("r2", {}).items()}
 

@@ -1,8 +1,8 @@
-"""Remake what data/ ships: the trait model, the policy and the pictures. Resumes where it was interrupted.
+"""Remake what data/ ships: trait models and their tables, the policy, pictures. Resumes where it was interrupted.
 
     .venv/bin/python scripts/make_shipped.py WORK_FOLDER
 
-Takes about half an hour on two cores. The commands it runs are those of data/README.md.
+Takes about an hour and a half on two cores. The commands it runs are those of data/README.md.
 """
 
 import shutil
@@ -20,9 +20,13 @@ from tint_sumo.cli import main as tint_sumo
 from tint_sumo.study.budgets import BUDGETS
 from tint_sumo.study.progress import progress_bar
 from tint_sumo.study.training import train_policy
+from tint_sumo.study.trait_models import evaluate_traits
+from tint_sumo.study.trait_study import TraitStudy
+from tint_sumo.traits.storage import add_to_card
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 QUICK = BUDGETS["quick"].ppo
+SHIPPED_TRAITS = {"ours": 0.0, "ours_plus": 0.05, "morton": 0.0, "classifier": 0.0}  # and the noise in training, m
 POLICY_STEPS = 1_200_000
 POLICY_SETTINGS = replace(QUICK, n_epochs=4, n_minibatches=4, learning_rate=1e-3, ent_coef=0.005, time_limit_s=50.0)
 
@@ -33,22 +37,38 @@ def run(*arguments: str) -> None:
         sys.exit(code)
 
 
-def make_models(work: Path) -> None:
-    dataset, traits, policy = (str(work / name) for name in ("dataset", "ours", "ours04"))
-    run("record", "--out", dataset, "--windows", "60000")
-    run("traits", "train", "--data", dataset, "--out", traits)
+def make_traits(work: Path) -> None:
+    """The comparison of trait methods: its tables, and one model of each method with its pictures."""
+    study, dataset = work / "traits", str(work / "traits" / "dataset")
+    run("traits", "study", "--out", str(study))
+    for name in ("traits.csv", "traits.md", "traits_seeds.csv", "traits_continuous.csv"):
+        copy(study / name, DATA / "results" / name)
+    copy(study / "traits.png", DATA / "images" / "traits.png")
+    for method, noise_m in SHIPPED_TRAITS.items():
+        model = DATA / "models" / f"{method}.safetensors"
+        trained = study / "models" / f"{method}-noise{noise_m:g}-seed0"
+        for suffix in (".safetensors", ".json"):
+            copy(trained / f"model{suffix}", model.with_suffix(suffix))
+        noises = TraitStudy().noises_m
+        accuracy = {f"{noise:g}": evaluate_traits(Path(dataset), model, noise_m=noise)["accuracy"] for noise in noises}
+        add_to_card(model, {"accuracy": accuracy})  # by noise in m; the classifiers are fitted to each noise
+        run("traits", "plot", "--data", dataset, "--model", str(model), "--noise", f"{noise_m}", "--out", str(work))
+        copy(work / "latent.png", DATA / "images" / f"latent_{method}.png")
+    run("traits", "plot", "--data", dataset, "--model", "ours", "--out", str(work))
+    copy(work / "reconstruction.png", DATA / "images" / "reconstruction.png")
+
+
+def make_policy(work: Path) -> None:
+    policy = work / "ours04"
     with progress_bar("policy ours", "step") as report:
-        train_policy("ours", 0.4, POLICY_STEPS, 0, Path(policy), settings=POLICY_SETTINGS, traits=traits, report=report)
-    copies = {
-        f"{traits}/model.safetensors": "ours.safetensors",
-        f"{traits}/model.json": "ours.json",
-        f"{policy}/policy.zip": "policy.zip",
-        f"{policy}/policy.json": "policy.json",
-        f"{policy}/traits.safetensors": "traits.safetensors",
-        f"{policy}/traits.json": "traits.json",
-    }
-    for source, name in copies.items():
-        shutil.copyfile(source, DATA / "models" / name)
+        train_policy("ours", 0.4, POLICY_STEPS, 0, policy, settings=POLICY_SETTINGS, traits="ours", report=report)
+    for name in ("policy.zip", "policy.json", "traits.safetensors", "traits.json"):
+        copy(policy / name, DATA / "models" / name)
+
+
+def copy(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
 
 
 def make_pictures() -> None:
@@ -67,4 +87,5 @@ if __name__ == "__main__":
         sys.exit(__doc__)
     torch.set_num_threads(1)  # the networks are small
     make_pictures()
-    make_models(Path(sys.argv[1]))
+    make_traits(Path(sys.argv[1]))
+    make_policy(Path(sys.argv[1]))

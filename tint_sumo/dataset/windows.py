@@ -60,9 +60,7 @@ def cut_windows(
     gap_m: NDArray[np.floating],
 ) -> Windows:
     """Windows from rows (M,) that are sorted by driver and time; ``gap_m`` is NaN without a leader."""
-    starts_track = np.r_[True, driver[1:] != driver[:-1]]
-    track_start = np.flatnonzero(starts_track)[np.cumsum(starts_track) - 1]
-    step = (np.arange(len(driver)) - track_start) % WINDOW_STEPS
+    step = steps_in_window(driver)
     window = np.cumsum(step == 0) - 1
     length = np.bincount(window)
     first = np.flatnonzero(step == 0)
@@ -74,6 +72,13 @@ def cut_windows(
     return Windows(states, length, driver[first], episode[first].astype(np.int64), ~leaderless)[
         length >= MIN_WINDOW_STEPS
     ]
+
+
+def steps_in_window(driver: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many steps of its window precede each row (M,), the rows sorted by driver and time."""
+    starts_track = np.r_[True, driver[1:] != driver[:-1]]
+    track_start = np.flatnonzero(starts_track)[np.cumsum(starts_track) - 1]
+    return np.asarray((np.arange(len(driver)) - track_start) % WINDOW_STEPS)
 
 
 def load_labels(folder: Path, windows: Windows) -> NDArray[np.bool_]:

@@ -1,0 +1,130 @@
+"""SUMO's floating-car data as rows, whatever wrote them: one per vehicle and timestep.
+
+``sumo --fcd-output FILE`` writes XML, CSV or Parquet by the suffix of FILE, the first two gzipped if it ends in .gz.
+Format: https://sumo.dlr.de/docs/Simulation/Output/FCDOutput.html
+"""
+
+import gzip
+import zlib
+from array import array
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, cast
+from xml.parsers import expat
+
+import numpy as np
+import pandas as pd
+
+from tint_sumo.errors import InputError
+
+_NAMES = {  # of the columns in SUMO's tables
+    "timestep_time": "time_s",
+    "vehicle_id": "vehicle",
+    "vehicle_lane": "lane",
+    "vehicle_pos": "pos_m",
+    "vehicle_speed": "speed_mps",
+}
+
+
+def read_fcd(file: Path) -> pd.DataFrame:
+    """Columns time_s, vehicle and lane (categories), pos_m (of the front, along the lane) and speed_mps.
+
+    XML is read in a stream: memory grows by 40 bytes for each vehicle and timestep. Persons are left out.
+
+    Raises:
+        InputError: no such file, a damaged one or none with floating-car data, a vehicle lacks an attribute, or there
+            is no vehicle.
+    """
+    if not file.is_file():
+        raise InputError(f"{file} is no file; give what sumo --fcd-output wrote")
+    try:
+        rows = _read_table(file) if {".csv", ".parquet"} & set(file.suffixes) else _read_xml(file)
+    except expat.ExpatError as error:
+        raise InputError(f"{file} is not whole XML ({error}); write it again with sumo --fcd-output") from None
+    except (EOFError, gzip.BadGzipFile, zlib.error, ValueError, KeyError) as error:  # pyarrow's errors are ValueErrors
+        if isinstance(error, InputError):
+            raise
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{file} is damaged ({reason}); write it again with sumo --fcd-output") from None
+    if rows.empty:
+        raise InputError(f"{file} has no vehicles; write it again with traffic in it")
+    return rows
+
+
+def _read_table(file: Path) -> pd.DataFrame:
+    columns = list(_NAMES)
+    if file.suffix == ".parquet":
+        rows = pd.read_parquet(file, columns=columns)
+    else:
+        rows = pd.read_csv(file, sep=";", usecols=columns, dtype={"vehicle_id": str, "vehicle_lane": str})
+    numbers = [column for column in columns if column not in ("vehicle_id", "vehicle_lane")]
+    kinds = {**dict.fromkeys(numbers, "float64"), "vehicle_id": "category", "vehicle_lane": "category"}
+    seen = rows[rows["vehicle_id"].notna()]  # an empty timestep is a row of its own
+    if not np.isfinite(seen[numbers].to_numpy(np.float64)).all() or seen["vehicle_lane"].isna().any():
+        raise InputError(f"{file}: a vehicle lacks its {_WANTED}")
+    return seen.astype(kinds).rename(columns=_NAMES)[list(_NAMES.values())].reset_index(drop=True)
+
+
+_WANTED = "lane, pos or speed; write the file again without --fcd-output.attributes"
+
+
+def _read_xml(file: Path) -> pd.DataFrame:
+    reader = _XmlReader(file)
+    with file.open("rb") as raw:
+        zipped = raw.read(2) == b"\x1f\x8b"
+        raw.seek(0)
+        reader.read(cast("IO[bytes]", gzip.GzipFile(fileobj=raw)) if zipped else raw)
+    return reader.rows()
+
+
+class _XmlReader:
+    """Keeps numbers only; ids of vehicles and lanes once each."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._parser = expat.ParserCreate()
+        self._parser.StartElementHandler = self._check_root
+        self._time_s = np.nan
+        self._numbers = {name: array("d") for name in ("time_s", "pos_m", "speed_mps")}
+        self._codes = {name: array("l") for name in ("vehicle", "lane")}
+        self._ids: dict[str, dict[str, int]] = {name: {} for name in self._codes}
+
+    def read(self, stream: IO[bytes]) -> None:
+        self._parser.ParseFile(stream)
+
+    def rows(self) -> pd.DataFrame:
+        categories = {
+            name: pd.Categorical.from_codes(np.asarray(codes), pd.Index(list(self._ids[name]), dtype=object))
+            for name, codes in self._codes.items()
+        }
+        numbers = {name: np.asarray(values) for name, values in self._numbers.items()}
+        return pd.DataFrame({**numbers, **categories})
+
+    def _check_root(self, name: str, _: Mapping[str, str]) -> None:
+        if name != "fcd-export":
+            raise InputError(f"{self._file} holds <{name}>, not <fcd-export>; give what sumo --fcd-output wrote")
+        self._parser.StartElementHandler = self._start
+
+    def _start(self, name: str, attributes: Mapping[str, str]) -> None:
+        try:
+            if name == "timestep":
+                self._time_s = float(attributes["time"])
+            elif name == "vehicle":
+                self._append(attributes)
+        except KeyError as missing:
+            raise InputError(
+                f"{self._here()} lacks {missing}; write the file without --fcd-output.attributes"
+            ) from None
+        except ValueError as error:
+            raise InputError(f"{self._here()} is damaged ({error}); write it again with sumo --fcd-output") from None
+
+    def _append(self, attributes: Mapping[str, str]) -> None:
+        pos_m, speed_mps = float(attributes["pos"]), float(attributes["speed"])
+        for name, text in (("vehicle", attributes["id"]), ("lane", attributes["lane"])):
+            ids = self._ids[name]
+            self._codes[name].append(ids.setdefault(text, len(ids)))
+        for name, value in (("time_s", self._time_s), ("pos_m", pos_m), ("speed_mps", speed_mps)):
+            self._numbers[name].append(value)
+
+    def _here(self) -> str:
+        return f"{self._file}, line {self._parser.CurrentLineNumber}"

@@ -1,0 +1,128 @@
+"""Tracks of vehicles at steps of 0.1 s, from floating-car data of any SUMO scenario or from a recorded dataset."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from tint_sumo.config import EpisodeRules, VehicleShape
+from tint_sumo.dataset.fcd import EPISODE_PERIOD_S
+from tint_sumo.dataset.fcd_reading import read_fcd
+from tint_sumo.dataset.leaders import Lanes, gaps_m
+from tint_sumo.dataset.schema import TRAJECTORIES, read_shard, read_shard_metadata
+from tint_sumo.errors import InputError
+
+STEP_S = EpisodeRules().step_s
+MAX_STEP_S = 1.0  # a straight line between farther points would be no driving any more
+_POS_DIGIT_M = 0.01  # SUMO's default precision
+_OWN_COLUMNS = ("episode", "vehicle", "time_s", "position_m", "gap_m")
+
+
+def read_tracks(
+    source: Path, *, net_file: Path | None = None, vehicle_length_m: float = VehicleShape().length_m
+) -> pd.DataFrame:
+    """Rows of tracks, sorted by track and time, at steps of 0.1 s.
+
+    Data in other steps, up to 1 s, are interpolated linearly. A vehicle that is missing for a step starts a new track.
+
+    Args:
+        source: floating-car data, a dataset's folder, its ``trajectories/`` or one file of them.
+        net_file: network of floating-car data; with it leaders are seen beyond the end of a lane.
+        vehicle_length_m: of the vehicles in floating-car data.
+
+    Returns:
+        Columns vehicle (category; EPISODE.VEHICLE for a dataset), track (number), time_s (episode e of a dataset starts
+        at e minutes, as in its floating-car data), position_m (of which differences count) and gap_m (bumper to bumper
+        to the leader, NaN without one).
+
+    Raises:
+        InputError: unusable files, a length that is not positive, or steps of more than 1 s.
+    """
+    if not 0.0 < vehicle_length_m < np.inf:
+        raise InputError(f"vehicle length must be positive, not {vehicle_length_m} m")
+    own = _own_part(source)
+    if own is not None:
+        if net_file is not None:
+            raise InputError(f"{source} knows its leaders; leave the network out")
+        return _in_steps(_recorded(own), source)
+    lanes = None if net_file is None else Lanes.read(net_file)
+    return _in_steps(_driven(read_fcd(source), vehicle_length_m, lanes), source)
+
+
+def _own_part(source: Path) -> Path | None:
+    """The Parquet file or folder of files with this project's trajectories; None if it must be floating-car data."""
+    if source.is_dir():
+        folder = source / TRAJECTORIES if (source / TRAJECTORIES).is_dir() else source
+        if not any(folder.glob("shard-*.parquet")):
+            raise InputError(f"{source} holds no trajectories; give a dataset's folder or a file of floating-car data")
+        return folder
+    if source.suffix == ".parquet" and source.is_file():
+        return source if set(_OWN_COLUMNS) <= set(read_shard_metadata(source).schema.names) else None
+    return None
+
+
+def _recorded(source: Path) -> pd.DataFrame:
+    """Columns vehicle, time_s, position_m and gap_m, by vehicle and time."""
+    rows = read_shard(source, list(_OWN_COLUMNS))
+    number, vehicles = pd.MultiIndex.from_frame(rows[["episode", "vehicle"]]).factorize()
+    return pd.DataFrame(
+        {
+            "vehicle": pd.Categorical.from_codes(number, pd.Index([f"{one}.{other}" for one, other in vehicles])),
+            "time_s": rows["episode"] * EPISODE_PERIOD_S + rows["time_s"].astype(float).round(3),
+            "position_m": rows["position_m"].astype(float),
+            "gap_m": rows["gap_m"].astype(float),
+        }
+    )
+
+
+def _driven(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None) -> pd.DataFrame:
+    """Columns vehicle, time_s, position_m and gap_m, by vehicle and time.
+
+    Speeds are the finer measure of displacements: rounded to 0.01 m/s they tell those of 0.1 s to the millimetre, and
+    SUMO's displacements are speed times step. Positions on one lane correct them beyond a position's last digit.
+    """
+    rows = rows.assign(gap_m=gaps_m(rows, vehicle_length_m, lanes))
+    rows = rows.sort_values(["vehicle", "time_s"], ignore_index=True)
+    moved_m = rows["pos_m"].diff().to_numpy()
+    along_lane = (rows["lane"].cat.codes.diff() == 0).to_numpy() & (moved_m > -_POS_DIGIT_M)
+    moved_m = np.where(along_lane, moved_m, np.nan)
+    by_speed_m = (rows["speed_mps"] * rows["time_s"].diff()).to_numpy()
+    displacement_m = np.fmin(np.fmax(by_speed_m, moved_m - _POS_DIGIT_M), moved_m + _POS_DIGIT_M)
+    displacement_m[0] = 0.0  # where another vehicle starts no difference counts
+    return rows[["vehicle", "time_s", "gap_m"]].assign(position_m=np.cumsum(displacement_m))
+
+
+def _in_steps(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
+    """Columns vehicle, track, time_s, position_m and gap_m at steps of 0.1 s, of rows by vehicle and time."""
+    interval_s = rows["time_s"].diff().to_numpy()[1:]
+    same = (rows["vehicle"].cat.codes.diff() == 0).to_numpy()[1:]
+    step_s = _step_s(interval_s[same], source)
+    start = np.flatnonzero(np.r_[True, ~same | (np.abs(interval_s - step_s) > step_s / 2)])
+    rows_each = np.diff(np.r_[start, len(rows)])
+    steps_each = np.floor(np.round((rows_each - 1) * step_s / STEP_S, 6)).astype(np.int64) + 1
+
+    track = np.repeat(np.arange(len(start)), steps_each)
+    step = np.arange(len(track)) - np.repeat(np.cumsum(steps_each) - steps_each, steps_each)
+    passed = np.round(step * STEP_S / step_s, 6)  # rows since the track's start
+    before = start[track] + np.floor(passed).astype(np.int64)
+    part = passed % 1.0
+
+    def interpolated(column: str) -> NDArray[np.float64]:
+        values = rows[column].to_numpy(np.float64)
+        return np.asarray(values[before] + part * (values[before + (part > 0.0)] - values[before]))
+
+    columns = {column: interpolated(column) for column in ("time_s", "position_m", "gap_m")}
+    return pd.DataFrame({"vehicle": rows["vehicle"].iloc[before].array, "track": track, **columns})
+
+
+def _step_s(interval_s: NDArray[np.float64], source: Path) -> float:
+    """The usual time between two rows of a vehicle, from all such times."""
+    if not len(interval_s):
+        raise InputError(f"{source} has no vehicle for two timesteps; write a longer run")
+    if (interval_s <= 0.0).any():
+        raise InputError(f"{source} has a vehicle twice at one time; write it again, in steps of 0.01 s or more")
+    step_s = round(float(np.median(interval_s)), 6)
+    if step_s > MAX_STEP_S:
+        raise InputError(f"{source} has steps of {step_s:g} s; write it with a period of {MAX_STEP_S:g} s at most")
+    return step_s

@@ -1,0 +1,109 @@
+"""Traits of the drivers in any SUMO scenario: a table of latents from floating-car data. No label is needed."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from tint_sumo.config import VehicleShape
+from tint_sumo.dataset.recorder import MIN_WINDOW_STEPS
+from tint_sumo.dataset.schema import NO_LEADER_GAP_M
+from tint_sumo.dataset.tracks import STEP_S, read_tracks
+from tint_sumo.dataset.windows import cut_windows, steps_in_window
+from tint_sumo.errors import InputError
+from tint_sumo.files import whole_file
+from tint_sumo.traits.cross_window import CrossWindow, fuse
+from tint_sumo.traits.evaluation import Latents, encode_windows
+from tint_sumo.traits.storage import load
+
+_SUFFIXES = (".csv", ".parquet")
+
+
+def infer_traits(
+    source: Path,
+    model: str | Path,
+    *,
+    net_file: Path | None = None,
+    vehicle_length_m: float = VehicleShape().length_m,
+) -> pd.DataFrame:
+    """Latents of every vehicle, a row for each window of 2 to 20 steps of 0.1 s, by vehicle and time.
+
+    Args:
+        source: floating-car data, or trajectories of a dataset, as in ``tint_sumo.dataset.tracks.read_tracks``.
+        model: name of a shipped model, folder of a training run, or path of a .safetensors file.
+        net_file: SUMO network of floating-car data; with it leaders are seen beyond the end of a lane.
+        vehicle_length_m: of the vehicles in floating-car data.
+
+    Returns:
+        vehicle (id), window (0, 1, ... of the vehicle), start_s, end_s, steps, has_leader (one within 20 m at every
+        step), latent_1, ... and std_1, ... (mean and standard deviation of the window's posterior). Of ``ours_plus``,
+        also fused_latent_1, ... and fused_std_1, ...: what the vehicle's windows say together, up to this one.
+
+    Raises:
+        InputError: unusable data, network, length or model.
+    """
+    trained = load(model)
+    rows = read_tracks(source, net_file=net_file, vehicle_length_m=vehicle_length_m)
+    track = rows["track"].to_numpy()
+    gap_m = rows["gap_m"].where(rows["gap_m"] < NO_LEADER_GAP_M).to_numpy()
+    windows = cut_windows(track, np.zeros_like(track), rows["position_m"].to_numpy(), gap_m)
+    if len(windows) == 0:
+        raise InputError(f"{source} has no vehicle for {MIN_WINDOW_STEPS} steps of {STEP_S} s; write a longer run")
+    first = np.flatnonzero(steps_in_window(track) == MIN_WINDOW_STEPS - 1) - (MIN_WINDOW_STEPS - 1)
+    vehicle, start_s = rows["vehicle"].iloc[first].array, rows["time_s"].to_numpy()[first]
+    number = pd.Series(vehicle.codes).groupby(vehicle.codes).cumcount().to_numpy(np.int64)
+    latents = encode_windows(trained, windows)
+    return pd.DataFrame(
+        {
+            "vehicle": vehicle,
+            "window": number,
+            "start_s": start_s.round(3),
+            "end_s": (start_s + (windows.length - 1) * STEP_S).round(3),
+            "steps": windows.length,
+            "has_leader": windows.has_leader,
+            **_columns("", latents),
+            **(_columns("fused_", _fuse_so_far(latents, number)) if isinstance(trained, CrossWindow) else {}),
+        }
+    )
+
+
+def write_table(table: pd.DataFrame, out: Path) -> None:
+    """Write CSV or Parquet, by the suffix of ``out``.
+
+    Raises:
+        InputError: ``out`` cannot be such a file.
+    """
+    require_table_file(out)
+    with whole_file(out) as partial:
+        if out.suffix == ".csv":
+            table.to_csv(partial, index=False)
+        else:
+            table.to_parquet(partial, index=False)
+
+
+def require_table_file(out: Path) -> None:
+    """Raise InputError unless a table can be written to ``out``."""
+    if out.suffix not in _SUFFIXES:
+        raise InputError(f"{out} must end in {' or '.join(_SUFFIXES)}; choose another --out")
+    if out.is_dir() or not next(parent for parent in out.parents if parent.exists()).is_dir():
+        raise InputError(f"{out} cannot be a file there; choose another --out")
+
+
+def _columns(prefix: str, latents: Latents) -> dict[str, NDArray[np.float32]]:
+    return {
+        f"{prefix}{name}_{index + 1}": values[:, index]
+        for name, values in (("latent", latents.mean), ("std", latents.std))
+        for index in range(values.shape[1])
+    }
+
+
+def _fuse_so_far(latents: Latents, number: NDArray[np.int64]) -> Latents:
+    """Of each window and those before it of its vehicle; ``number`` (N,) counts them, in rows by vehicle."""
+    mean, log_var = torch.from_numpy(latents.mean).clone(), 2.0 * torch.from_numpy(latents.std).log()
+    for now in np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1]):
+        pair = np.stack((now - 1, now), axis=1)
+        counts = torch.from_numpy(pair >= (now - number[now])[:, None])  # first windows have none before them
+        mean[now], log_var[now] = fuse(mean[pair], log_var[pair], counts)
+    return Latents(mean.numpy(), torch.exp(0.5 * log_var).numpy())

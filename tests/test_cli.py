@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pandas
 import pytest
 import torch
 
@@ -30,6 +31,7 @@ COMMANDS = (
     "traits train",
     "traits evaluate",
     "traits plot",
+    "traits infer",
     "traits study",
     "policy train",
     "policy evaluate",
@@ -146,6 +148,19 @@ def test_traits(dataset: Path, tmp_path: Path, trait_model: Path, capsys: pytest
     assert all(Path(file).read_bytes().startswith(b"\x89PNG") for file in printed["files"])
 
 
+@pytest.mark.parametrize("name", ["table.csv", "below/table.parquet"])
+def test_traits_infer(
+    name: str, dataset: Path, tmp_path: Path, trait_model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / name
+    printed = run(capsys, "traits", "infer", "--fcd", dataset, "--model", trait_model, "--out", out)
+    table = pandas.read_csv(out, dtype={"vehicle": str}) if out.suffix == ".csv" else pandas.read_parquet(out)
+    assert printed["out"] == str(out)
+    assert printed["columns"] == list(table)
+    assert printed["windows"] == len(table) == json.loads((dataset / "manifest.json").read_text())["windows"]
+    assert printed["vehicles"] == table["vehicle"].nunique()
+
+
 def test_policy_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
     printed = run(capsys, "policy", "evaluate", "--model", "always_go", "--episodes", 6, "--p-conservative", 0.9)
     assert printed["success"] + printed["collision"] + printed["timeout"] == pytest.approx(1.0)
@@ -223,6 +238,14 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ("traits evaluate --data NOWHERE --model MODEL", "dataset"),
         ("traits evaluate --data DATA --model MODEL --noise nan", "noise is a standard deviation"),
         ("traits evaluate --data DATA --model nobody", "no trait model nobody"),
+        ("traits infer --fcd NOWHERE --model MODEL --out OUT.csv", "is no file"),
+        ("traits infer --fcd DATA --model nobody --out OUT.csv", "no trait model nobody"),
+        ("traits infer --fcd DATA --model MODEL --out OUT", "must end in .csv or .parquet"),
+        ("traits infer --fcd DATA --model MODEL --out MODEL/table.csv", "cannot be a file there"),
+        ("traits infer --fcd DATA --model MODEL --net NOWHERE --out OUT.csv", "knows its leaders"),
+        ("traits infer --fcd MODEL --model MODEL --net NOWHERE --out OUT.csv", "is no file"),
+        ("traits infer --fcd MODEL --model MODEL --out OUT.csv", "is not whole XML"),
+        ("traits infer --fcd DATA --model MODEL --vehicle-length 0 --out OUT.csv", "vehicle length"),
         ("policy train --method magic --out OUT", "unknown method 'magic'"),
         ("policy train --method ttc --out OUT", "hand-written rule"),
         ("policy train --method oracle --p-conservative -0.1 --out OUT", "p_conservative"),
@@ -246,6 +269,8 @@ def test_bad_values(
         "DATA": dataset,
         "MODEL": trait_model,
         "WIDE": trait_model.with_stem("wide"),
+        "OUT.csv": tmp_path / "out.csv",
+        "MODEL/table.csv": trait_model / "table.csv",
     }
     before = files(dataset)
     assert message in refuse(capsys, *(places.get(word, word) for word in argv.split()))

@@ -199,6 +199,32 @@ class PlotTraits(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class InferTraits(Command):
+    """Infer the traits of the vehicles in any SUMO run: a table of latents per vehicle and window of 2 s."""
+
+    fcd: Path
+    """What sumo --fcd-output wrote (XML, CSV, Parquet), or a recorded dataset."""
+    model: str
+    """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
+    out: Path
+    """The table, .csv or .parquet."""
+    net: Path | None = None
+    """The scenario's .net.xml; without it nobody sees a leader beyond the end of a lane."""
+    vehicle_length: float = 5.0
+    """Length of the vehicles in floating-car data, m."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.traits.inference import infer_traits, require_table_file, write_table
+
+        require_table_file(self.out)
+        table = infer_traits(self.fcd, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length)
+        write_table(table, self.out)
+        content = {"out": str(self.out), "windows": len(table), "vehicles": int(table["vehicle"].nunique())}
+        text = f"{content['windows']} windows of {content['vehicles']} vehicles: {self.out}"
+        return Outcome(text, {**content, "columns": list(table)})
+
+
+@dataclass(frozen=True, kw_only=True)
 class StudyTraits(Command):
     """Compare all trait methods at every position noise, hours of work; the same command resumes an interrupted one."""
 
@@ -369,6 +395,7 @@ class Traits:
         Annotated[TrainTraits, subcommand("train")]
         | Annotated[EvaluateTraits, subcommand("evaluate")]
         | Annotated[PlotTraits, subcommand("plot")]
+        | Annotated[InferTraits, subcommand("infer")]
         | Annotated[StudyTraits, subcommand("study")]
     )
 

@@ -24,6 +24,9 @@ _NAMES = {  # of the columns in SUMO's tables
     "vehicle_pos": "pos_m",
     "vehicle_speed": "speed_mps",
 }
+_NUMBERS = ["time_s", "pos_m", "speed_mps"]
+_IDS = ["vehicle", "lane"]
+_AGAIN = "write it again with sumo --fcd-output"
 
 
 def read_fcd(file: Path) -> pd.DataFrame:
@@ -39,33 +42,28 @@ def read_fcd(file: Path) -> pd.DataFrame:
         raise InputError(f"{file} is no file; give what sumo --fcd-output wrote")
     try:
         rows = _read_table(file) if {".csv", ".parquet"} & set(file.suffixes) else _read_xml(file)
+    except InputError:
+        raise
     except expat.ExpatError as error:
-        raise InputError(f"{file} is not whole XML ({error}); write it again with sumo --fcd-output") from None
-    except (EOFError, gzip.BadGzipFile, zlib.error, ValueError, KeyError) as error:  # pyarrow's errors are ValueErrors
-        if isinstance(error, InputError):
-            raise
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{file} is damaged ({reason}); write it again with sumo --fcd-output") from None
+        raise InputError(f"{file} is not whole XML ({error}); {_AGAIN}") from None
+    except (EOFError, gzip.BadGzipFile, zlib.error, ValueError, KeyError) as error:  # pyarrow's are ValueErrors
+        raise InputError(f"{file} is damaged ({str(error).splitlines()[0]}); {_AGAIN}") from None
     if rows.empty:
         raise InputError(f"{file} has no vehicles; write it again with traffic in it")
+    if rows.isna().any(axis=None) or np.isinf(rows[_NUMBERS]).any(axis=None):
+        raise InputError(f"{file} has a vehicle without time, lane, pos or speed; {_AGAIN}")
     return rows
 
 
 def _read_table(file: Path) -> pd.DataFrame:
-    columns = list(_NAMES)
     if file.suffix == ".parquet":
-        rows = pd.read_parquet(file, columns=columns)
+        rows = pd.read_parquet(file, columns=list(_NAMES))
     else:
-        rows = pd.read_csv(file, sep=";", usecols=columns, dtype={"vehicle_id": str, "vehicle_lane": str})
-    numbers = [column for column in columns if column not in ("vehicle_id", "vehicle_lane")]
-    kinds = {**dict.fromkeys(numbers, "float64"), "vehicle_id": "category", "vehicle_lane": "category"}
-    seen = rows[rows["vehicle_id"].notna()]  # an empty timestep is a row of its own
-    if not np.isfinite(seen[numbers].to_numpy(np.float64)).all() or seen["vehicle_lane"].isna().any():
-        raise InputError(f"{file}: a vehicle lacks its {_WANTED}")
-    return seen.astype(kinds).rename(columns=_NAMES)[list(_NAMES.values())].reset_index(drop=True)
-
-
-_WANTED = "lane, pos or speed; write the file again without --fcd-output.attributes"
+        rows = pd.read_csv(file, sep=";", usecols=list(_NAMES), dtype={"vehicle_id": str, "vehicle_lane": str})
+    rows = rows.rename(columns=_NAMES)[list(_NAMES.values())]
+    rows = rows[rows["vehicle"].notna()]  # an empty timestep is a row of its own
+    kinds = {**dict.fromkeys(_NUMBERS, "float64"), **dict.fromkeys(_IDS, "category")}
+    return rows.astype(kinds).reset_index(drop=True)
 
 
 def _read_xml(file: Path) -> pd.DataFrame:
@@ -85,9 +83,9 @@ class _XmlReader:
         self._parser = expat.ParserCreate()
         self._parser.StartElementHandler = self._check_root
         self._time_s = np.nan
-        self._numbers = {name: array("d") for name in ("time_s", "pos_m", "speed_mps")}
-        self._codes = {name: array("l") for name in ("vehicle", "lane")}
-        self._ids: dict[str, dict[str, int]] = {name: {} for name in self._codes}
+        self._numbers = {name: array("d") for name in _NUMBERS}
+        self._codes = {name: array("l") for name in _IDS}
+        self._ids: dict[str, dict[str, int]] = {name: {} for name in _IDS}
 
     def read(self, stream: IO[bytes]) -> None:
         self._parser.ParseFile(stream)
@@ -98,7 +96,7 @@ class _XmlReader:
             for name, codes in self._codes.items()
         }
         numbers = {name: np.asarray(values) for name, values in self._numbers.items()}
-        return pd.DataFrame({**numbers, **categories})
+        return pd.DataFrame({**numbers, **categories})[list(_NAMES.values())]
 
     def _check_root(self, name: str, _: Mapping[str, str]) -> None:
         if name != "fcd-export":
@@ -116,15 +114,15 @@ class _XmlReader:
                 f"{self._here()} lacks {missing}; write the file without --fcd-output.attributes"
             ) from None
         except ValueError as error:
-            raise InputError(f"{self._here()} is damaged ({error}); write it again with sumo --fcd-output") from None
+            raise InputError(f"{self._here()} is damaged ({error}); {_AGAIN}") from None
 
     def _append(self, attributes: Mapping[str, str]) -> None:
-        pos_m, speed_mps = float(attributes["pos"]), float(attributes["speed"])
-        for name, text in (("vehicle", attributes["id"]), ("lane", attributes["lane"])):
+        numbers = (self._time_s, float(attributes["pos"]), float(attributes["speed"]))
+        for name, number in zip(_NUMBERS, numbers, strict=True):
+            self._numbers[name].append(number)
+        for name, text in zip(_IDS, (attributes["id"], attributes["lane"]), strict=True):
             ids = self._ids[name]
             self._codes[name].append(ids.setdefault(text, len(ids)))
-        for name, value in (("time_s", self._time_s), ("pos_m", pos_m), ("speed_mps", speed_mps)):
-            self._numbers[name].append(value)
 
     def _here(self) -> str:
         return f"{self._file}, line {self._parser.CurrentLineNumber}"

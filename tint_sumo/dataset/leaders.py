@@ -58,8 +58,8 @@ def _successor(lane: Any) -> str:
 def gaps_m(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None = None) -> NDArray[np.float64]:
     """Gap (M,) from each vehicle's front to the back of the next one ahead at that time; NaN if none is seen.
 
-    A leader is seen on the vehicle's own lane and, if ``lanes`` are given, on those that follow it without a choice, as
-    far as ``NO_LEADER_GAP_M``.
+    A leader is seen on the vehicle's own lane and, if ``lanes`` are given, on those that follow it without a choice and
+    begin so near that the gap can be less than ``NO_LEADER_GAP_M``.
 
     Args:
         rows: columns time_s, lane and pos_m as ``tint_sumo.dataset.fcd_reading.read_fcd`` gives them.

@@ -53,7 +53,7 @@ def infer_traits(
         raise InputError(f"{source} has no vehicle for {MIN_WINDOW_STEPS} steps of {STEP_S} s; write a longer run")
     first = np.flatnonzero(steps_in_window(track) == MIN_WINDOW_STEPS - 1) - (MIN_WINDOW_STEPS - 1)
     vehicle, start_s = rows["vehicle"].iloc[first].array, rows["time_s"].to_numpy()[first]
-    number = pd.Series(vehicle.codes).groupby(vehicle.codes).cumcount().to_numpy(np.int64)
+    number = np.asarray(pd.Series(vehicle.codes).groupby(vehicle.codes).cumcount(), np.int64)
     latents = encode_windows(trained, windows)
     return pd.DataFrame(
         {

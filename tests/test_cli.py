@@ -239,6 +239,7 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ("traits evaluate --data DATA --model MODEL --noise nan", "noise is a standard deviation"),
         ("traits evaluate --data DATA --model nobody", "no trait model nobody"),
         ("traits infer --fcd NOWHERE --model MODEL --out OUT.csv", "is no file"),
+        ("traits infer --fcd MODEL --model MODEL --out MODEL", "holds the data themselves"),
         ("traits infer --fcd DATA --model nobody --out OUT.csv", "no trait model nobody"),
         ("traits infer --fcd DATA --model MODEL --out OUT", "must end in .csv or .parquet"),
         ("traits infer --fcd DATA --model MODEL --out MODEL/table.csv", "cannot be a file there"),

@@ -216,6 +216,8 @@ class InferTraits(Command):
     def run(self) -> Outcome:
         from tint_sumo.traits.inference import infer_traits, require_table_file, write_table
 
+        if self.out.resolve() == self.fcd.resolve():
+            raise InputError(f"{self.out} holds the data themselves; choose another --out")
         require_table_file(self.out)
         table = infer_traits(self.fcd, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length)
         write_table(table, self.out)

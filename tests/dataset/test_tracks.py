@@ -123,6 +123,13 @@ def test_who_vanishes_comes_back_on_a_new_track(tmp_path: Path) -> None:
     np.testing.assert_allclose(rows["time_s"], [0.0, 0.1, 0.2, 0.5, 0.6])
 
 
+def test_persons_are_left_out(tmp_path: Path) -> None:
+    person = '<person id="p" x="1" y="1" angle="0" speed="1" pos="1" edge="e"/>'
+    text = fcd({0.1 * step: [("a", "e_0", 0.1 * step, 1.0)] for step in range(3)})
+    (tmp_path / "fcd.xml").write_text(text.replace("</timestep>", f"{person}</timestep>"))
+    assert read_tracks(tmp_path / "fcd.xml")["vehicle"].tolist() == ["a"] * 3
+
+
 # Bad input
 
 

@@ -26,6 +26,7 @@ SMALL = TraitStudy(
     continuous_windows=100,
     continuous_methods=("ours_plus",),
     continuous_latents=(3,),
+    continuous_epochs=1,
 )
 
 

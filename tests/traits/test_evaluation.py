@@ -7,7 +7,7 @@ import torch
 from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.windows import split_by_episode
 from tint_sumo.errors import InputError
-from tint_sumo.traits.evaluation import TEST_FRACTION, encode_windows, evaluate
+from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, encode_windows, evaluate, linear_r2
 from tint_sumo.traits.vae import Vae
 
 
@@ -83,3 +83,49 @@ def test_encoding_in_parts_changes_nothing(separable, monkeypatch):
     monkeypatch.setattr("tint_sumo.traits.evaluation.ENCODING_BATCH", 100)
     np.testing.assert_allclose(encode_windows(model, separable[0], noise_m=0.1).mean, whole, atol=1e-6)
     assert whole.shape == (len(separable[1]), 2)
+
+
+def test_the_neighbours_see_what_no_line_can(model, street):
+    """A ring around a cluster: no straight line tells them apart."""
+    windows, conservative = street
+    angle = np.linspace(0.0, 40.0, len(conservative))
+    ring = np.stack((np.cos(angle), np.sin(angle)), axis=1)
+    result = evaluate(model, with_latents(windows, np.where(conservative[:, None], ring, 0.1 * ring)), conservative)
+    assert result.accuracy < 0.9
+    assert result.knn_accuracy == 1.0
+
+
+class Unsure(FirstStep):
+    """Gives the second latent as its uncertainty, too."""
+
+    def encode(self, states, length):
+        return states[:, 0], 2.0 * states[:, 0, 1:].abs().log().expand(-1, 2)
+
+
+def test_errors_among_the_most_uncertain_windows_are_counted(street):
+    windows, conservative = street
+    wrong = np.arange(len(conservative)) % 20 == 0
+    latents = np.stack((np.where(conservative ^ wrong, 1.0, -1.0), np.where(wrong, 0.5, 0.1)), axis=1)
+    unsure = Unsure(TraitSettings(embedding_sizes=(4, 4), hidden_size=4)).eval()
+    found = evaluate(unsure, with_latents(windows, latents), conservative)
+    assert found.accuracy == pytest.approx(0.95, abs=0.03)
+    assert found.errors_in_most_uncertain_tenth == 1.0
+
+
+def test_a_probe_is_fitted_once_and_applied_to_other_windows(model, separable):
+    windows, conservative = separable
+    probe = Probe(model, windows, conservative)
+    few = np.flatnonzero(conservative)[:7]
+    assert probe.score(windows[few], conservative[few]).accuracy == 1.0
+    assert probe.score(windows[few], ~conservative[few]).accuracy == 0.0
+    with pytest.raises(InputError, match="no windows to evaluate on"):
+        probe.score(windows[few[:0]], conservative[few[:0]])
+
+
+def test_a_linear_map_recovers_what_is_linear_in_the_latents(model, street):
+    windows, _ = street
+    latents = np.random.default_rng(0).normal(size=(len(windows), 2))
+    properties = np.stack((latents @ [2.0, -1.0] + 5.0, np.random.default_rng(1).normal(size=len(windows))), axis=1)
+    r2 = linear_r2(model, with_latents(windows, latents), properties)
+    assert r2[0] == pytest.approx(1.0, abs=1e-4)
+    assert r2[1] < 0.1

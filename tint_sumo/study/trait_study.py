@@ -42,6 +42,8 @@ class TraitStudy:
     continuous_windows: int = 240_000
     continuous_methods: tuple[str, ...] = ("ours", "ours_plus")
     continuous_latents: tuple[int, ...] = (2, 4)
+    continuous_seeds: tuple[int, ...] = (0, 1)
+    continuous_epochs: int = 10  # properties without classes take longer to show
 
 
 def run_trait_study(study: TraitStudy, out: Path, *, workers: int = 2, progress: bool = True) -> TraitReport:
@@ -83,7 +85,7 @@ def plan(study: TraitStudy, out: Path) -> list[Job]:
     comparisons = [CompareJob(study, method, seed, out) for seed in study.seeds for method in study.methods]
     continuous = [
         ContinuousJob(study, method, latent_size, seed, out)
-        for seed in study.seeds
+        for seed in study.continuous_seeds
         for method in study.continuous_methods
         for latent_size in study.continuous_latents
     ]
@@ -207,7 +209,7 @@ class ContinuousJob:
         train, _ = split_by_episode(windows, TEST_FRACTION, self.seed)
         model = train_model(
             windows[train],
-            self.study.settings,
+            replace(self.study.settings, epochs=self.study.continuous_epochs),
             folder,
             method=self.method,
             seed=self.seed,

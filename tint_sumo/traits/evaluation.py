@@ -40,7 +40,9 @@ class TraitAccuracy:
     knn_accuracy: float  # of the nearest neighbours in the latent space
     windows: int
     error_m: float | None  # root mean square of reconstructed or predicted positions; None if the method has none
-    errors_in_most_uncertain_tenth: float | None  # share of the linear classifier's errors; None without errors
+    errors_in_most_uncertain_tenth: (
+        float | None
+    )  # share of the linear classifier's errors; None without errors or with point estimates
     by_length: Mapping[str, Part]  # keyed "2-5", "6-10", "11-19", "20"
     by_leader: Mapping[str, Part]  # keyed "with_leader", "without_leader"
 
@@ -193,7 +195,7 @@ def position_error_m(model: TraitModel, windows: Windows, *, noise_m: float = 0.
 
 def _share_of_errors(correct: NDArray[np.bool_], std: NDArray[np.float32]) -> float | None:
     """Share of the errors that lie among the tenth of the windows with the widest posterior; chance is 0.1."""
-    if correct.all():
+    if correct.all() or not std.any():
         return None
     widest = np.argsort(-std.prod(axis=1), kind="stable")[: -(-len(correct) // 10)]
     return float((~correct[widest]).sum() / (~correct).sum())

@@ -140,6 +140,7 @@ class TrainTraits(Command):
         from tint_sumo.study.budgets import TRAIT_BUDGETS
         from tint_sumo.study.trait_models import require_noise, train_traits
 
+        _use_one_thread()
         require_noise(self.noise)
         settings = replace(TRAIT_BUDGETS[self.budget], noise_m=self.noise)
         card = train_traits(self.data, self.out, method=self.method, settings=settings, seed=self.seed)
@@ -162,6 +163,7 @@ class EvaluateTraits(Command):
     def run(self) -> Outcome:
         from tint_sumo.study.trait_models import evaluate_traits
 
+        _use_one_thread()
         found = evaluate_traits(self.data, self.model, noise_m=self.noise)
         parts = {**found["by_length"], **found["by_leader"]}
         lines = [
@@ -194,6 +196,7 @@ class PlotTraits(Command):
     def run(self) -> Outcome:
         from tint_sumo.study.trait_models import plot_traits
 
+        _use_one_thread()
         files = plot_traits(self.data, self.model, self.out, noise_m=self.noise)
         return Outcome("\n".join(f"wrote {file}" for file in files), {"files": [str(file) for file in files]})
 
@@ -219,6 +222,7 @@ class InferTraits(Command):
         if self.out.resolve() == self.fcd.resolve():
             raise InputError(f"{self.out} holds the data themselves; choose another --out")
         require_table_file(self.out)
+        _use_one_thread()
         table = infer_traits(self.fcd, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length)
         write_table(table, self.out)
         content = {"out": str(self.out), "windows": len(table), "vehicles": int(table["vehicle"].nunique())}
@@ -461,7 +465,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _use_one_thread() -> None:
-    """Policies are small: more threads gain little, and cost a multiple as soon as other work needs the cores."""
+    """The networks are small: more threads gain little, and cost a multiple as soon as other work needs the cores."""
     import torch
 
     torch.set_num_threads(1)

@@ -51,7 +51,7 @@ def make_traits(work: Path) -> None:
             copy(trained / f"model{suffix}", model.with_suffix(suffix))
         noises = TraitStudy().noises_m
         accuracy = {f"{noise:g}": evaluate_traits(Path(dataset), model, noise_m=noise)["accuracy"] for noise in noises}
-        add_to_card(model, {"accuracy": accuracy})  # by noise in m; the classifiers are fitted to each noise
+        add_to_card(model, {"accuracy_by_noise": accuracy})  # in m; the linear classifier is fitted to each noise
         run("traits", "plot", "--data", dataset, "--model", str(model), "--noise", f"{noise_m}", "--out", str(work))
         copy(work / "latent.png", DATA / "images" / f"latent_{method}.png")
     run("traits", "plot", "--data", dataset, "--model", "ours", "--out", str(work))

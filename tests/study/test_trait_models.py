@@ -12,6 +12,7 @@ from tint_sumo.study import trait_models
 from tint_sumo.study.trait_models import evaluate_traits, plot_traits, train_traits
 from tint_sumo.traits import METHODS
 from tint_sumo.traits.evaluation import TEST_FRACTION
+from tint_sumo.traits.storage import find, read_card
 
 SMALL = TraitSettings(
     embedding_sizes=(8, 8), hidden_size=8, encoder_output_size=8, decoder_output_size=8, batch_size=64, epochs=1
@@ -73,6 +74,24 @@ def test_evaluation_and_pictures_take_the_episodes_left_out_by_the_model_s_seed(
     np.testing.assert_array_equal(drawn[0], windows.episode[test])
     labels = load_labels(dataset, windows)[test]
     assert max(labels.mean(), 1 - labels.mean()) - 0.05 <= found["accuracy"] <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "noise_m", "least"),
+    [
+        ("ours", 0.0, 0.985),
+        ("ours_plus", 0.0, 0.99),
+        ("ours_plus", 0.05, 0.98),
+        ("morton", 0.0, 0.97),
+        ("classifier", 0.0, 0.99),
+    ],
+)
+def test_shipped_models_are_small_and_tell_unseen_drivers_apart(
+    dataset: Path, name: str, noise_m: float, least: float
+) -> None:
+    assert find(name).with_suffix(".safetensors").stat().st_size < 2_000_000
+    assert evaluate_traits(dataset, name, noise_m=noise_m)["accuracy"] >= least
+    assert read_card(name)["accuracy_by_noise"][f"{noise_m:g}"] >= least
 
 
 def test_noise_makes_evaluation_harder_and_is_repeatable(dataset: Path) -> None:

@@ -16,6 +16,7 @@ from tint_sumo.study.evaluation import OUTCOMES, Evaluation
 from tint_sumo.study.methods import METHODS
 from tint_sumo.study.published import RATES_PERCENT
 from tint_sumo.study.results import Result, read_results
+from tint_sumo.study.tables import markdown_table
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
 INK = {"success": "white", "timeout": "black", "collision": "white"}  # of the numbers on these colours
@@ -132,17 +133,12 @@ def to_markdown(rows: Sequence[Row]) -> str:
                 " / ".join(f"{rate:g}" for rate in row.published.values()) or "-",
             ]
         )
-    widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
-    lines.insert(1, ["-" * width for width in widths])
-    table = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines
-    ]
     note = (
         "Rates with 95 % Wilson intervals over all episodes; they leave out the spread between training seeds.\n"
         "time: mean navigation time of successful episodes. "
         "paper: published success / timeout / collision of 500 episodes."
     )
-    return "\n".join(table) + "\n\n" + note + "\n"
+    return markdown_table(lines) + "\n\n" + note + "\n"
 
 
 def _rate_text(evaluation: Evaluation, outcome: str) -> str:

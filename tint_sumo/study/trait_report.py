@@ -1,7 +1,6 @@
 """Table and figure of the comparison of trait methods, from the results of its jobs."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from matplotlib.figure import Figure
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, whole_file, write_text
 from tint_sumo.study.results import RESULTS
+from tint_sumo.study.tables import markdown_table
 
 COLOURS = {"ours": "#1b6ca8", "ours_plus": "#0b7a3b", "morton": "#c8682c", "classifier": "#555555"}
 
@@ -106,7 +106,7 @@ def _accuracy_table(table: pd.DataFrame) -> str:
                 "-" if pd.isna(row["training_s"]) else f"{row['training_s']:.0f}",
             ]
         )
-    return _markdown(lines) + (
+    return markdown_table(lines) + (
         f"\n\nMean ± standard deviation over {int(table['seeds'].max())} training seeds; "
         f"{int(table['training_windows'].mean()):,} training and {int(table['windows'].mean()):,} test windows of "
         "other episodes. Every model is trained and tested with the noise of its row. Position error: root mean square "
@@ -130,7 +130,8 @@ def _parts_table(table: pd.DataFrame) -> str:
         cells = ["-" if pd.isna(row[name]) else f"{row[name]:.2f}" for name in measures.values()]
         lines.append([str(row["method"]), f"{row['noise_m']:g}", *cells])
     return (
-        _markdown(lines) + "\n\nLinear SVC, percent: by the window's length, with and without a leader, and at another "
+        markdown_table(lines)
+        + "\n\nLinear SVC, percent: by the window's length, with and without a leader, and at another "
         "P(conservative) with neither model nor classifier trained anew. Means over the seeds."
     )
 
@@ -145,7 +146,8 @@ def _continuous_table(continuous: pd.DataFrame) -> str:
         cells = [_with_spread(means[name], spreads[name], ".3f") for name in measures]
         lines.append([*map(str, case), *cells])
     return (
-        _markdown(lines) + "\n\nDrivers without classes: how well a linear map from the latents gives what each driver "
+        markdown_table(lines)
+        + "\n\nDrivers without classes: how well a linear map from the latents gives what each driver "
         "was drawn with, windows of unseen episodes, no noise."
     )
 
@@ -156,14 +158,6 @@ def _mean_sd(row: dict[Any, Any], name: str, form: str) -> str:
 
 def _with_spread(mean: Any, spread: Any, form: str) -> str:
     return f"{mean:{form}}" if pd.isna(spread) else f"{mean:{form}} ± {spread:{form}}"
-
-
-def _markdown(lines: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    rows = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines
-    ]
-    return "\n".join([rows[0], "| " + " | ".join("-" * width for width in widths) + " |", *rows[1:]])
 
 
 def plot_noise(table: pd.DataFrame, file: Path) -> None:

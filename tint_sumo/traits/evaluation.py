@@ -79,7 +79,9 @@ class Probe:
         seed: int = 0,
     ) -> None:
         if len(np.unique(conservative)) < 2:
-            raise InputError("both traits and several episodes are needed to evaluate; record a larger dataset of population traits")
+            raise InputError(
+                "both traits and several episodes are needed to evaluate; record a larger dataset of population traits"
+            )
         self._model, self._noise_m, self._seed = model, noise_m, seed
         mean = encode_windows(model, windows, noise_m=noise_m, seed=seed).mean
         reference = np.random.default_rng(seed).permutation(len(mean))[:KNN_REFERENCES]

@@ -82,7 +82,7 @@ def test_the_figure(dataset: Path, tmp_path: Path) -> None:
 def test_a_trait_nobody_has(tmp_path: Path) -> None:
     some = Distribution.of(pd.Series([2.4]))
     lonely = Inspection(
-        MappingProxyType({"windows": 1}),
+        MappingProxyType({"windows": 1, "population": "traits"}),
         {"conservative": TraitStatistics(1, 1, some, some, some), "aggressive": TraitStatistics()},
         some,
         some,

@@ -62,7 +62,7 @@ def test_floating_car_data_give_nearly_the_same(dataset: Path) -> None:
     assert len(both) > 0.99 * len(exact) == 0.99 * len(rounded)
     error = np.abs(both[LATENTS].to_numpy() - both[[f"{name}_fcd" for name in LATENTS]].to_numpy())
     assert np.median(error) < 0.01
-    assert error.max() < 0.1
+    assert error.max() < 0.2
     assert exact[LATENTS].std().min() > 1.0
 
 

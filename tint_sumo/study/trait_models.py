@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo import traits
-from tint_sumo.config import TraitSettings
+from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.dataset.windows import Windows, load_labels, load_windows, read_manifest, split_by_episode
 from tint_sumo.errors import InputError
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
@@ -37,12 +37,34 @@ def train_traits(
     """
     if seed < 0:
         raise InputError(f"seed must not be negative: {seed}")
-    windows = load_windows(data)
-    chosen, _ = split_by_episode(windows, TEST_FRACTION, seed)
-    labels = load_labels(data, windows)[chosen] if find_method(method).uses_labels else None
-    card = {"data": describe(data)}
-    train(windows[chosen], settings, out, method=method, seed=seed, conservative=labels, progress=progress, card=card)
+    train_on_split(data, load_windows(data), out, method=method, settings=settings, seed=seed, progress=progress)
     return read_card(out / "model.safetensors")
+
+
+def train_on_split(
+    data: Path,
+    windows: Windows,
+    out: Path,
+    *,
+    method: str,
+    settings: TraitSettings,
+    seed: int,
+    latent_size: int = LATENT_SIZE,
+    progress: bool = True,
+) -> traits.TraitModel:
+    """``train_traits`` on all ``windows`` of the dataset ``data``, loaded before; the trained model."""
+    chosen, _ = split_by_episode(windows, TEST_FRACTION, seed)
+    return train(
+        windows[chosen],
+        settings,
+        out,
+        method=method,
+        seed=seed,
+        latent_size=latent_size,
+        conservative=load_labels(data, windows)[chosen] if find_method(method).uses_labels else None,
+        progress=progress,
+        card={"data": describe(data)},
+    )
 
 
 def evaluate_traits(data: Path, model: str | Path, *, noise_m: float = 0.0) -> dict[str, Any]:

@@ -16,12 +16,11 @@ from tint_sumo.study.budgets import TRAIT_BUDGETS
 from tint_sumo.study.pool import THREADS_PER_JOB, Job, run_jobs
 from tint_sumo.study.progress import Report
 from tint_sumo.study.results import RESULTS
-from tint_sumo.study.trait_models import describe
+from tint_sumo.study.trait_models import train_on_split
 from tint_sumo.study.trait_report import TraitReport, write_trait_report
 from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, linear_r2
 from tint_sumo.traits.model import find_method
 from tint_sumo.traits.storage import RUN_MODEL, add_to_card
-from tint_sumo.traits.training import train as train_model
 
 DATASET_SEED = 2022
 PROPERTIES = ("desired_speed_mps", "min_gap_m")
@@ -144,15 +143,10 @@ class CompareJob:
         train, test = split_by_episode(windows, TEST_FRACTION, self.seed)
         resumes = folder.exists()
         began = time.perf_counter()
-        model = train_model(
-            windows[train],
-            replace(self.study.settings, noise_m=noise_m),
-            folder,
-            method=self.method,
-            seed=self.seed,
-            conservative=conservative[train] if find_method(self.method).uses_labels else None,
-            progress=False,
-            card={"data": describe(self.out / "dataset")},
+        settings = replace(self.study.settings, noise_m=noise_m)
+        data = self.out / "dataset"
+        model = train_on_split(
+            data, windows, folder, method=self.method, settings=settings, seed=self.seed, progress=False
         )
         training_s = None if resumes else round(time.perf_counter() - began, 1)
         probe = Probe(model, windows[train], conservative[train], noise_m=noise_m, seed=self.seed)
@@ -206,16 +200,15 @@ class ContinuousJob:
         data = self.out / "continuous"
         folder = self.out / "models" / self.name.replace(" ", "-")
         windows = load_windows(data)
-        train, _ = split_by_episode(windows, TEST_FRACTION, self.seed)
-        model = train_model(
-            windows[train],
-            replace(self.study.settings, epochs=self.study.continuous_epochs),
+        model = train_on_split(
+            data,
+            windows,
             folder,
             method=self.method,
+            settings=replace(self.study.settings, epochs=self.study.continuous_epochs),
             seed=self.seed,
             latent_size=self.latent_size,
             progress=False,
-            card={"data": describe(data)},
         )
         properties = load_drivers(data, windows, PROPERTIES).to_numpy(np.float64)
         r2 = dict(zip(PROPERTIES, linear_r2(model, windows, properties, seed=self.seed).tolist(), strict=True))

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tint_sumo.config import LATENT_SIZE, WINDOW_STEPS, TraitSettings
+from tint_sumo.dataset.recorder import MIN_WINDOW_STEPS
 from tint_sumo.traits.batches import Batch
 from tint_sumo.traits.encoder import kl_divergence, sample
 from tint_sumo.traits.model import FEATURES, TraitModel, register, valid_steps
@@ -14,7 +15,6 @@ from tint_sumo.traits.model import FEATURES, TraitModel, register, valid_steps
 SAMPLES = 8  # latents per window in the estimate of the predictive likelihood
 KL_WEIGHT = 0.01  # holds the latents near the standard normal prior, and hardly more
 LOG_STD_RANGE = (-4.0, 3.0)  # of predicted features; a perfect prediction is no denser than exp(4)
-SHORTEST_PIECE = 2  # steps; a single one has no motion
 
 
 @register
@@ -52,7 +52,7 @@ class CrossWindow(TraitModel):
         lengths = (length.unsqueeze(1) - WINDOW_STEPS * torch.arange(pieces)).clamp(0, WINDOW_STEPS)
         mean, log_var = super().encode(padded.reshape(-1, WINDOW_STEPS, 2), lengths.flatten().clamp(min=1))
         shape = (len(states), pieces, self.latent_size)
-        return fuse(mean.view(shape), log_var.view(shape), lengths >= SHORTEST_PIECE)
+        return fuse(mean.view(shape), log_var.view(shape), lengths >= MIN_WINDOW_STEPS)
 
     def loss(self, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
         """Terms ``kl`` and ``prediction``, the negative log-likelihood of the other window, in nats per window."""

@@ -1,5 +1,6 @@
 """The package as users install it."""
 
+import ast
 import subprocess
 import sys
 import zipfile
@@ -61,7 +62,7 @@ def test_importing_the_package_is_cheap() -> None:
 
 def test_floors_import_downwards_only() -> None:
     floors = [
-        "config errors files processes progress",
+        "compiling config errors files processes progress",
         "scenario",
         "simulation",
         "envs dataset",
@@ -83,3 +84,22 @@ def test_floors_import_downwards_only() -> None:
                 other = words[1].split(".")[1]
                 assert floor_of[other] <= floor_of[own], f"{file}: {line.strip()}"
                 assert other == own or floor_of[other] < floor_of[own] or floor_of[own] == 0, f"{file}: {line.strip()}"
+
+
+def test_compiled_functions_use_nothing_of_other_files() -> None:
+    """Machine code is renewed when its own file changes, not when a constant or function of another one does."""
+    checked = 0
+    for file in (ROOT / "tint_sumo").rglob("*.py"):
+        module = ast.parse(file.read_text(encoding="utf-8"))
+        ours = {
+            alias.asname or alias.name
+            for node in module.body
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("tint_sumo")
+            for alias in node.names
+        }
+        for function in module.body:
+            if isinstance(function, ast.FunctionDef) and "compiled" in map(ast.unparse, function.decorator_list):
+                used = {node.id for part in function.body for node in ast.walk(part) if isinstance(node, ast.Name)}
+                assert not used & ours, f"{file}: {function.name} uses {used & ours}"
+                checked += 1
+    assert checked > 5

@@ -213,7 +213,7 @@ def _checking_steps_per_s(sizes: Sizes, seed: int) -> float:
             for replica in np.flatnonzero(over).tolist():
                 simulation.reset(replica, [seed, replica, step])
             simulation.step(rng.choice(scenario.ego.desired_speeds_mps, sizes.replicas))
-            over = simulation.collided | (simulation.ego_pose().x_m > scenario.episode.goal_x_m)
+            over = simulation.collided | (simulation.ego_pose["x_m"] > scenario.episode.goal_x_m)
         return _bare_steps_per_s(simulation)
     finally:
         simulation.close()
@@ -230,9 +230,9 @@ def _breakdown(sizes: Sizes) -> dict[str, Any]:
         clocks.watch(simulation, "_admit", "spawning")
         clocks.watch(simulation, "reset", "spawning")
         clocks.watch(simulation, "_update_claims", "claims")
-        clocks.watch(simulation, "_measure_distances", "safety_check")
-        clocks.watch(driven.batch, "_state", "observation")
-        clocks.watch(episodes, "step", "other")  # driving the egos, rewards
+        clocks.watch(simulation, "_check_safety", "safety_check")
+        clocks.watch(episodes, "_observe", "observation")
+        clocks.watch(episodes, "step", "other")  # driving the egos, rewards, the end of episodes
         clocks.watch(driven.batch, "step", "other")
         clocks.watch(driven.env, "step", "adapter")
         steps = sum(driven.turn() for _ in range(sizes.turns))

@@ -137,9 +137,9 @@ def test_the_observation_is_what_the_table_says(env: TIntersectionEnv) -> None:
     for _ in range(30):
         observation, *_, info = env.step(np.int64(GO))
     speed = simulation.ego_speed_mps[0] / 3.0
-    pose = simulation.ego_pose()
-    heading = np.array([pose.heading_x[0], pose.heading_y[0]])
-    assert observation["ego"][:2] * 20.0 == pytest.approx([pose.x_m[0], pose.y_m[0]], abs=1e-5)
+    pose = simulation.ego_pose[0]
+    heading = np.array([pose["heading_x"], pose["heading_y"]])
+    assert observation["ego"][:2] * 20.0 == pytest.approx([pose["x_m"], pose["y_m"]], abs=1e-5)
     assert observation["ego"][2:] == pytest.approx(speed * heading, abs=1e-6)
     slots = np.flatnonzero(observation["mask"])
     for slot in slots:
@@ -198,7 +198,7 @@ def test_rewards_and_outcomes(preset: str) -> None:
             assert truncated is (outcome == "timeout")
             assert ("collision" in info) is (outcome == "collision")
             if outcome == "success":
-                assert env._episodes.simulation.ego_pose().x_m[0] > 8.0
+                assert env._episodes.simulation.ego_pose["x_m"][0] > 8.0
             if outcome == "timeout":
                 assert info["time_s"] == pytest.approx(15.0)
         assert outcomes == {"success", "collision", "timeout"}

@@ -49,6 +49,6 @@ def test_all_replicas_have_the_same_lane_lengths(net: sumolib.net.Net) -> None:
 
 
 def test_the_egos_lanes_follow_its_path(net: sumolib.net.Net) -> None:
-    path = EgoPath(Street(), VehicleShape())
+    path = EgoPath.of(Street(), VehicleShape())
     lanes = ("stem.0_0", ":L.0_0_0", "mid.0_0", ":U.0_1_0")
     assert sum(net.getLane(one).getLength() for one in lanes) == pytest.approx(path.turn_end_m, abs=0.01)

@@ -8,8 +8,8 @@ import pytest
 from tests.simulation.scenes import GO, STEP_S, scene
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, MAX_VEHICLES, EgoController, Idm, Population, Scenario, Traffic
 from tint_sumo.errors import InputError
-from tint_sumo.scenario.geometry import LANE_DIRECTION, LOWER, UPPER, box_distance_m
-from tint_sumo.simulation.ego import is_unsafe
+from tint_sumo.scenario.geometry import LANE_DIRECTION, LOWER, UPPER, measure_distances_m
+from tint_sumo.simulation.ego import EgoRules, is_unsafe
 from tint_sumo.simulation.intersections import (
     NO_COLLISION_CHECK,
     SUMO_COLLISION_CHECK,
@@ -83,7 +83,7 @@ def crowd() -> Iterator[tuple[Intersections, list[Any]]]:
         desired = rng.choice(DESIRED_MPS, 60) if step % 10 else np.full(60, GO)
         simulation.step(desired)
         for replica in range(60):
-            if simulation.collision[replica] or simulation.ego_pose().x_m[replica] > 8.0:
+            if simulation.collision[replica] or simulation.ego_pose["x_m"][replica] > 8.0:
                 simulation.reset(replica, [8, replica, step])
         states.append({key: np.array(getattr(simulation, key)) for key in STATE})
     yield simulation, states
@@ -220,12 +220,12 @@ def test_the_modelled_ego_is_where_sumo_has_it() -> None:
         for _ in range(130):
             simulation.step(np.array([rng.choice([0.5, 3.0, 3.0])]))
             ego_id = simulation._ego_ids[0]
-            pose = simulation.ego_pose()
+            pose = simulation.ego_pose[0]
             assert vehicle.getSpeed(ego_id) == pytest.approx(simulation.ego_speed_mps[0], abs=1e-9)
-            assert vehicle.getPosition(ego_id) == pytest.approx((pose.front_x_m[0], pose.front_y_m[0]), abs=0.02)
-            heading_deg = np.degrees(np.arctan2(pose.heading_x[0], pose.heading_y[0]))
+            assert vehicle.getPosition(ego_id) == pytest.approx((pose["front_x_m"], pose["front_y_m"]), abs=0.02)
+            heading_deg = np.degrees(np.arctan2(pose["heading_x"], pose["heading_y"]))
             assert vehicle.getAngle(ego_id) == pytest.approx(heading_deg, abs=0.5)
-        assert simulation.ego_pose().x_m[0] > 8.0
+        assert simulation.ego_pose["x_m"][0] > 8.0
 
 
 def test_positions_are_sumos() -> None:
@@ -244,8 +244,10 @@ def test_positions_are_sumos() -> None:
 
 
 def ego_distances_m(simulation: Intersections) -> Any:
-    distance_m = box_distance_m(simulation.ego_pose(), simulation.x_m, simulation.y_m, simulation.scenario.vehicle)
-    return np.where(simulation.present, distance_m, np.inf)
+    distance_m = np.empty(simulation.present.shape)
+    state = (simulation.ego_pose, simulation.present, simulation.x_m, simulation.y_m)
+    measure_distances_m(*state, np.inf, 5.0, 2.0, distance_m)
+    return distance_m
 
 
 def careless(replicas: int, collision_options: Sequence[str]) -> Intersections:
@@ -323,6 +325,7 @@ def test_the_safety_check_misses_no_vehicle() -> None:
     try:
         for replica in range(replicas):
             simulation.reset(replica, [6, replica])
+        rules = EgoRules.of(simulation.scenario)
         rng = np.random.default_rng(6)
         found, before_m = [], np.full((replicas, MAX_VEHICLES), np.inf)
         for step in range(300):
@@ -330,11 +333,14 @@ def test_the_safety_check_misses_no_vehicle() -> None:
             known = np.isfinite(before_m) & np.isfinite(now_m)
             approach_m = np.subtract(before_m, now_m, out=np.zeros_like(now_m), where=known)
             found.append(simulation._unsafe.copy())
-            expected = is_unsafe(now_m, approach_m / STEP_S, simulation.scenario.ego).any(axis=1)
+            expected = [
+                any(is_unsafe(now, approach / STEP_S, rules) for now, approach in zip(*pair, strict=True))
+                for pair in zip(now_m, approach_m, strict=True)
+            ]
             np.testing.assert_array_equal(found[-1], expected)
             simulation.step(rng.choice(DESIRED_MPS, replicas) if step % 20 else np.full(replicas, GO))
             before_m = now_m
-            for replica in np.flatnonzero(simulation.collided | (simulation.ego_pose().x_m > 8.0)).tolist():
+            for replica in np.flatnonzero(simulation.collided | (simulation.ego_pose["x_m"] > 8.0)).tolist():
                 simulation.reset(replica, [6, replica, step])
                 before_m[replica] = np.inf
         assert 0.1 < np.mean(found) < 0.9

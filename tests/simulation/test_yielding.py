@@ -26,7 +26,7 @@ def test_conservative_lower_lane_driver_passes_an_ego_that_stands_short_of_its_p
 def test_conservative_driver_leaves_room_for_the_ego_to_drive_on() -> None:
     with scene((LOWER, CONSERVATIVE, 12.0)) as simulation:
         assert min(speeds(simulation, GO)) < 1.0
-        assert simulation.ego_pose().x_m[0] > 8.0
+        assert simulation.ego_pose["x_m"][0] > 8.0
         assert simulation.collision[0] is None
 
 
@@ -34,7 +34,7 @@ def test_conservative_driver_leaves_room_for_the_ego_to_drive_on() -> None:
 def test_upper_lane_driver_reacts_only_past_y_4(path_m: float, reacts: bool) -> None:
     with scene((UPPER, CONSERVATIVE, -18.0)) as simulation:
         stand_at(simulation, path_m)
-        front_y_m = simulation.ego_pose().front_y_m[0]
+        front_y_m = simulation.ego_pose["front_y_m"][0]
         assert (front_y_m > 5.0) if reacts else (3.0 < front_y_m < 4.0)
         slowest_mps = min(speeds(simulation, STOP))
         assert slowest_mps < 0.05 if reacts else slowest_mps == pytest.approx(2.4)
@@ -65,7 +65,7 @@ def test_drivers_go_on_when_the_ego_gives_up_its_claim() -> None:
         stand_at(simulation, -0.3)
         until(simulation, GO, lambda: bool(simulation.has_claimed[0, LOWER]))
         until(simulation, STOP, lambda: not simulation.has_claimed[0, LOWER])
-        assert simulation.ego_pose().front_y_m[0] < 1.0
+        assert simulation.ego_pose["front_y_m"][0] < 1.0
         assert speeds(simulation, STOP)[-1] == pytest.approx(2.4, abs=0.01)
         assert simulation.collision[0] is None
 

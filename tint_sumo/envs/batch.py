@@ -8,26 +8,9 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from tint_sumo.config import MAX_VEHICLES
-from tint_sumo.envs.episodes import REWARD_TERMS, Episodes, Observation, TaskSettings, Transition
+from tint_sumo.envs.episodes import Episodes, TaskSettings
 from tint_sumo.envs.rendering import render_intersection
-
-# What each environment has to tell after every step.
-ROW = np.dtype(
-    [
-        ("ego", np.float32, (4,)),
-        ("vehicles", np.float32, (MAX_VEHICLES, 2)),
-        ("mask", np.float32, (MAX_VEHICLES,)),
-        ("traits", np.int8, (MAX_VEHICLES,)),
-        ("time_s", np.float64),
-        ("reward", np.float64),
-        ("terminated", np.bool_),
-        ("truncated", np.bool_),
-        *((term, np.float64) for term in REWARD_TERMS),
-    ],
-    align=True,
-)
-Rows = dict[str, NDArray[Any]]  # an array (N, ...) for each field of ROW
+from tint_sumo.envs.rows import OBSERVATION_KEYS, OUTCOMES, Observation, Rows
 
 
 @dataclass(frozen=True)
@@ -43,12 +26,14 @@ class Ended:
 
 
 class Batch(Protocol):
-    """Environments that step together. Returned arrays belong to the caller."""
+    """Environments that step together."""
 
-    def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> Rows:
+    rows: Rows  # (N,) what the environments tell; written anew by each call
+
+    def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> None:
         """Start a new episode where the mask (N,) is true; without a seed, from the environment's own generator."""
 
-    def step(self, actions: NDArray[np.integer]) -> tuple[Rows, list[Ended]]:
+    def step(self, actions: NDArray[np.integer]) -> list[Ended]:
         """Take valid actions (N,); an episode that ends is followed by the next one at once."""
 
     def render(self) -> list[NDArray[np.uint8]]: ...
@@ -59,14 +44,14 @@ class Batch(Protocol):
 class LocalBatch:
     """A batch in this process: intersections of one simulation."""
 
-    def __init__(self, num_envs: int, settings: TaskSettings) -> None:
-        self.episodes = Episodes(num_envs, settings)
+    def __init__(self, num_envs: int, settings: TaskSettings, rows: Rows | None = None) -> None:
+        self.episodes = Episodes(num_envs, settings, rows)
+        self.rows = self.episodes.rows
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
 
-    def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> Rows:
+    def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> None:
         for index in np.flatnonzero(mask).tolist():
             self._begin(index, seeds[index])
-        return self._state()
 
     def _begin(self, index: int, seed: int | None = None) -> None:
         rng = self._rngs[index]
@@ -75,31 +60,22 @@ class LocalBatch:
             self._rngs[index] = rng
         self.episodes.begin(index, rng)
 
-    def step(self, actions: NDArray[np.integer]) -> tuple[Rows, list[Ended]]:
-        transition = self.episodes.step(actions)
-        state = self._state()
-        ended = [self._ended(index, state, transition) for index in np.flatnonzero(transition.done).tolist()]
+    def step(self, actions: NDArray[np.integer]) -> list[Ended]:
+        if not self.episodes.step(actions):
+            return []
+        ended = [self._ended(index) for index in np.flatnonzero(self.rows["outcome"]).tolist()]
         for one in ended:
             self._begin(one.index)
-        if ended:
-            state = self._state()
-        outcome = {
-            "reward": transition.reward,
-            "terminated": transition.terminated,
-            "truncated": transition.timeout,
-        }
-        return state | outcome | transition.reward_terms, ended
+        return ended
 
-    def _state(self) -> Rows:
-        return {**self.episodes.observe(), "traits": self.episodes.traits(), "time_s": self.episodes.time_s()}
-
-    def _ended(self, index: int, state: Rows, transition: Transition) -> Ended:
+    def _ended(self, index: int) -> Ended:
+        row = self.rows[index].copy()
         return Ended(
             index,
-            {key: state[key][index] for key in ("ego", "vehicles", "mask")},
-            state["traits"][index],
-            str(transition.outcome[index]),
-            float(state["time_s"][index]),
+            {key: row[key] for key in OBSERVATION_KEYS},
+            row["traits"],
+            OUTCOMES[row["outcome"]],
+            float(row["time_s"]),
             self.episodes.collision_info(index),
         )
 

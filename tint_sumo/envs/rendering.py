@@ -32,9 +32,9 @@ def render_intersection(simulation: Intersections, replica: int) -> NDArray[np.u
         colour = tuple(int(part) for part in profile.colour.split(","))
         centre = (simulation.x_m[replica, slot], simulation.y_m[replica, slot])
         canvas.vehicle(centre, (direction, 0.0), shape.length_m, shape.width_m, colour)
-    pose = simulation.ego_pose()
-    heading = (pose.heading_x[replica], pose.heading_y[replica])
-    canvas.vehicle((pose.x_m[replica], pose.y_m[replica]), heading, shape.length_m, shape.width_m, _EGO)
+    pose = simulation.ego_pose[replica]
+    heading = (pose["heading_x"], pose["heading_y"])
+    canvas.vehicle((pose["x_m"], pose["y_m"]), heading, shape.length_m, shape.width_m, _EGO)
     return canvas.image()
 
 

@@ -7,15 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.config import Backend
-from tint_sumo.envs.episodes import (
-    Episodes,
-    Observation,
-    TaskSettings,
-    action_space,
-    observation_space,
-    require_actions,
-)
+from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_actions
 from tint_sumo.envs.rendering import RENDER_FPS, render_intersection, require_render_mode
+from tint_sumo.envs.rows import OBSERVATION_KEYS, OUTCOMES, REWARD_TERMS, ROW, Observation
 
 
 class TIntersectionEnv(gymnasium.Env[Any, Any]):
@@ -107,33 +101,23 @@ class TIntersectionEnv(gymnasium.Env[Any, Any]):
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
         self._episodes.begin(0, self.np_random)
-        return self._observation(), self._info("")
+        told = self._told()
+        return _observation(told), _info(told)
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         actions = np.array([action])
         require_actions(actions, 1)
-        transition = self._episodes.step(actions)
-        info = self._info(str(transition.outcome[0]))
-        info["reward_terms"] = {term: float(value[0]) for term, value in transition.reward_terms.items()}
-        if transition.collision[0]:
+        self._episodes.step(actions)
+        told = self._told()
+        info = _info(told)
+        info["reward_terms"] = {term: told[term] for term in REWARD_TERMS}
+        if info["outcome"] == "collision":
             info["collision"] = self._episodes.collision_info(0)
-        return (
-            self._observation(),
-            float(transition.reward[0]),
-            bool(transition.terminated[0]),
-            bool(transition.timeout[0]),
-            info,
-        )
+        return _observation(told), told["reward"], told["terminated"], told["truncated"], info
 
-    def _observation(self) -> Observation:
-        return {key: value[0] for key, value in self._episodes.observe().items()}
-
-    def _info(self, outcome: str) -> dict[str, Any]:
-        return {
-            "traits": self._episodes.traits()[0],
-            "outcome": outcome,
-            "time_s": float(self._episodes.time_s()[0]),
-        }
+    def _told(self) -> dict[str, Any]:
+        """The row's fields as Python's numbers, and arrays that the next step overwrites."""
+        return dict(zip(ROW.names or (), self._episodes.rows.item(), strict=True))
 
     def render(self) -> NDArray[np.uint8] | None:
         """(H, W, 3) image of the intersection; conservative drivers blue, aggressive red, the ego yellow."""
@@ -143,3 +127,11 @@ class TIntersectionEnv(gymnasium.Env[Any, Any]):
 
     def close(self) -> None:
         self._episodes.simulation.close()
+
+
+def _observation(told: dict[str, Any]) -> Observation:
+    return {key: told[key].copy() for key in OBSERVATION_KEYS}
+
+
+def _info(told: dict[str, Any]) -> dict[str, Any]:
+    return {"traits": told["traits"].copy(), "outcome": OUTCOMES[told["outcome"]], "time_s": told["time_s"]}

@@ -9,16 +9,10 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from tint_sumo.config import Backend
-from tint_sumo.envs.batch import Batch, Ended, LocalBatch, Rows
-from tint_sumo.envs.episodes import (
-    REWARD_TERMS,
-    Observation,
-    TaskSettings,
-    action_space,
-    observation_space,
-    require_actions,
-)
+from tint_sumo.envs.batch import Batch, Ended, LocalBatch
+from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space, require_actions
 from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
+from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, copied
 from tint_sumo.envs.workers import WorkerBatch
 from tint_sumo.errors import InputError
 
@@ -79,7 +73,8 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         if len(seeds) != self.num_envs:
             raise InputError(f"{len(seeds)} seeds do not fit {self.num_envs} environments; give one number or as many")
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
-        rows = self.batch.reset(seeds, mask)
+        self.batch.reset(seeds, mask)
+        rows = copied(self.batch.rows)
         return _observation(rows), self._infos(rows)
 
     def step(
@@ -87,14 +82,15 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         actions = np.asarray(actions)
         require_actions(actions, self.num_envs)
-        rows, ended = self.batch.step(actions)
+        ended = self.batch.step(actions)
+        rows = copied(self.batch.rows)
         infos = self._infos(rows)
         infos |= self._everywhere({"reward_terms": self._everywhere({term: rows[term] for term in REWARD_TERMS})})
         if ended:
             infos |= self._final(infos, ended)
         return _observation(rows), rows["reward"], rows["terminated"], rows["truncated"], infos
 
-    def _infos(self, rows: Rows) -> dict[str, Any]:
+    def _infos(self, rows: dict[str, NDArray[Any]]) -> dict[str, Any]:
         outcome = np.full(self.num_envs, "")  # an episode that ended has been followed by the next
         return self._everywhere({"traits": rows["traits"], "outcome": outcome, "time_s": rows["time_s"]})
 
@@ -123,8 +119,8 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         self.batch.close()
 
 
-def _observation(rows: Rows) -> Observation:
-    return {key: rows[key] for key in ("ego", "vehicles", "mask")}
+def _observation(rows: dict[str, NDArray[Any]]) -> Observation:
+    return {key: rows[key] for key in OBSERVATION_KEYS}
 
 
 def _masked(values: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:

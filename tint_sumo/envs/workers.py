@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.envs.batch import ROW, Ended, LocalBatch, Rows
+from tint_sumo.envs.batch import Ended, LocalBatch
 from tint_sumo.envs.episodes import TaskSettings
+from tint_sumo.envs.rows import ROW, Rows
 from tint_sumo.errors import InputError
 from tint_sumo.processes import SPAWN, end_with_parent, interrupts_blocked
 
@@ -31,7 +32,7 @@ class WorkerBatch:
     """
 
     def __init__(self, num_envs: int, settings: TaskSettings, workers: int) -> None:
-        self._actions, self._rows, memory = _shared(num_envs)
+        self._actions, self.rows, memory = _shared(num_envs)
         bounds = [num_envs * worker // workers for worker in range(workers + 1)]
         self._shares = [slice(*share) for share in pairwise(bounds)]
         self._pipes: list[Connection] = []
@@ -47,28 +48,23 @@ class WorkerBatch:
             self._processes.append(process)
         self._listen()
 
-    def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> Rows:
+    def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> None:
         self._ask(*(("reset", seeds[share], mask[share]) for share in self._shares))
-        return self._copy()
 
-    def step(self, actions: NDArray[np.integer]) -> tuple[Rows, list[Ended]]:
+    def step(self, actions: NDArray[np.integer]) -> list[Ended]:
         self._actions[:] = actions
         answers = self._ask(*(("step",) for _ in self._shares))
-        ended = [
+        return [
             replace(one, index=one.index + share.start)
             for share, answer in zip(self._shares, answers, strict=True)
             for one in answer
         ]
-        return self._copy(), ended
 
     def render(self) -> list[NDArray[np.uint8]]:
         return [image for images in self._ask(*(("render",) for _ in self._shares)) for image in images]
 
     def close(self) -> None:
         self._finalizer()
-
-    def _copy(self) -> Rows:
-        return {field: self._rows[field].copy() for field in ROW.names or ()}
 
     def _ask(self, *requests: tuple[Any, ...]) -> list[Any]:
         """Send each worker its request and return their answers."""
@@ -102,7 +98,7 @@ class WorkerBatch:
         return content
 
 
-def _shared(num_envs: int, memory: Any = None) -> tuple[NDArray[np.int64], NDArray[np.void], Any]:
+def _shared(num_envs: int, memory: Any = None) -> tuple[NDArray[np.int64], Rows, Any]:
     """Actions (N,), rows (N,) of the environments, and the shared memory they lie in, new if none is given.
 
     The memory has no name in the file system: nothing is left of it when the last process ends, however it ends.
@@ -140,24 +136,18 @@ def _serve(pipe: Connection, memory: Any, num_envs: int, share: slice, settings:
 def _answer_requests(pipe: Connection, memory: Any, num_envs: int, share: slice, settings: TaskSettings) -> None:
     actions, rows, _ = _shared(num_envs, memory)
     actions, rows = actions[share], rows[share]
-    batch = LocalBatch(len(rows), settings)
+    batch = LocalBatch(len(rows), settings, rows)
     try:
         pipe.send(("ready", None))
         while True:
             request, *arguments = pipe.recv()
             answer: Any = None
             if request == "reset":
-                _write(rows, batch.reset(*arguments))
+                batch.reset(*arguments)
             elif request == "step":
-                told, answer = batch.step(actions)
-                _write(rows, told)
+                answer = batch.step(actions)
             else:
                 answer = batch.render()
             pipe.send(("done", answer))
     finally:
         batch.close()
-
-
-def _write(rows: NDArray[np.void], told: Rows) -> None:
-    for field, values in told.items():
-        rows[field] = values

@@ -18,7 +18,7 @@ import sumo
 
 from tint_sumo.config import Street, VehicleShape
 from tint_sumo.errors import InputError
-from tint_sumo.scenario.geometry import EgoPath, junction_span_m, lane_border_y_m
+from tint_sumo.scenario.geometry import EgoPath, junction_span_m, lane_border_y_m, path_point
 
 LOWER_ROUTE = ("lower_in", "lower_out")
 UPPER_ROUTE = ("upper_in", "upper_out")
@@ -104,13 +104,13 @@ class _Replica:
 
     def _turn(self, start_m: float, end_m: float, points: int) -> str:
         """Part of the ego's path, between two path lengths."""
-        x, y, _ = EgoPath(self.street, self.vehicle).point(np.linspace(start_m, end_m, points))
-        return self._shape(*zip(x.tolist(), y.tolist(), strict=True))
+        path = EgoPath.of(self.street, self.vehicle)
+        return self._shape(*(path_point(path_m, path)[:2] for path_m in np.linspace(start_m, end_m, points).tolist()))
 
     @property
     def _link_m(self) -> tuple[float, float]:
         """Path lengths between which the edge from the lower junction to the upper one lies."""
-        border_m = EgoPath(self.street, self.vehicle).crossing_m(lane_border_y_m(self.street))
+        border_m = EgoPath.of(self.street, self.vehicle).crossing_m(lane_border_y_m(self.street))
         return border_m - _HALF_LINK_M, border_m + _HALF_LINK_M
 
     def nodes(self) -> list[str]:
@@ -163,7 +163,7 @@ class _Replica:
             ends = f'from="{name(start, self.index)}" to="{name(end, self.index)}"'
             return f'<connection {ends} fromLane="0" toLane="0"{shape}/>'
 
-        path = EgoPath(self.street, self.vehicle)
+        path = EgoPath.of(self.street, self.vehicle)
         link_start_m, link_end_m = self._link_m
         first = f"{self._shape((0, 0))} {self._turn(path.turn_start_m, link_start_m, _TURN_POINTS)}"
         second = self._turn(link_end_m, path.turn_end_m, _TURN_POINTS)

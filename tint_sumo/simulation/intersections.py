@@ -5,7 +5,6 @@ it runs in. State is kept in arrays, (R,) for egos and (R, 12) for vehicle slots
 per-vehicle call into SUMO each step reads its lane position.
 """
 
-import math
 import tempfile
 import weakref
 from collections.abc import Iterator, Sequence
@@ -13,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tint_sumo.config import MAX_VEHICLES, Backend, Scenario
 from tint_sumo.errors import InputError
@@ -22,23 +20,25 @@ from tint_sumo.scenario.drivers import EGO_TYPE, members
 from tint_sumo.scenario.geometry import (
     LANE_NAMES,
     LOWER,
+    POSE,
     UPPER,
     Bools,
     EgoPath,
     Floats,
-    Pose,
-    box_distance_m,
+    Poses,
     centre_x_m,
     lane_y_m,
+    locate,
+    measure_distances_m,
+    place,
     stage_start_m,
 )
 from tint_sumo.scenario.network import EGO_ROUTE, lane_id, name
-from tint_sumo.simulation import ego as ego_control
 from tint_sumo.simulation.connection import Connection, connect
-from tint_sumo.simulation.traffic import DriverPool, DriverStream
+from tint_sumo.simulation.ego import EgoRules, check_safety, drive, update_claims
+from tint_sumo.simulation.traffic import DriverPool, DriverStream, admit
 
 _EMPTY = -1
-_OPEN_ROAD_M = 1e9  # gap on a lane without vehicles
 _STEP_MARGIN_M = 1.0  # more than a vehicle and the ego come closer in a step
 _EGO_PREFIX = "ego"
 _SPEED_MODE_OBEY_SETSPEED = 32  # all of SUMO's own checks off: the ego drives exactly the speed it is given
@@ -116,9 +116,10 @@ class Intersections:
     ``x_m``, ``y_m``   (R, 12)  vehicle centres
     ``ego_front_m``    (R,)     front bumper's distance along the ego's path
     ``ego_speed_mps``  (R,)
+    ``ego_pose``       (R,)     records of :data:`~tint_sumo.scenario.geometry.POSE`
     ``time_s``         (R,)     since the episode's start
-    ``collided``       (R,)     whether the ego has had a collision in the episode
-    ``collision``      R items  the first one, or None
+    ``has_claimed``    (R, 2)   which lanes (lower, upper) the ego claims
+    ``collision``      R items  the ego's first collision in the episode, or None
     ================== ======== ==================================================================
 
     A vehicle keeps its slot while it is on the street, and a slot stays empty for at least one step between two
@@ -137,17 +138,17 @@ class Intersections:
         self.scenario = scenario = scenario or Scenario()
         self.replicas = replicas
         self.population = members(scenario.population)
-        self.path = EgoPath(scenario.street, scenario.vehicle)
+        self.path = EgoPath.of(scenario.street, scenario.vehicle)
+        self._ego_rules = EgoRules.of(scenario)
         self._with_ego = with_ego
         self._pool = DriverPool(self.population, scenario)
         self._yields = np.array([*(member.profile.yields for member in self.population), False])  # the last: empty
         self._lane_y_m = lane_y_m(scenario.street)
         self._stage_start_m = stage_start_m(scenario.street, scenario.vehicle)
+        self._lengths_m = (scenario.street.half_length_m, scenario.vehicle.length_m)
 
-        reach_m = max(scenario.ego.closing_distance_m, scenario.ego.unsafe_distance_m) + _STEP_MARGIN_M
-        reach_m += math.hypot(scenario.vehicle.length_m, scenario.vehicle.width_m) / 2  # of the ego, however it stands
-        self._watch_x_m = reach_m + scenario.vehicle.length_m / 2
-        self._watch_y_m = reach_m + scenario.vehicle.width_m / 2
+        # Of the safety check, which needs to know how far away a vehicle was a step before.
+        self._reach_m = max(scenario.ego.closing_distance_m, scenario.ego.unsafe_distance_m) + _STEP_MARGIN_M
 
         slots = (replicas, MAX_VEHICLES)
         self.present: Bools = np.zeros(slots, bool)
@@ -159,18 +160,20 @@ class Intersections:
         self.y_m: Floats = np.zeros(slots)
         self.ego_front_m: Floats = np.zeros(replicas)
         self.ego_speed_mps: Floats = np.zeros(replicas)
+        self.ego_pose: Poses = np.zeros(replicas, POSE)
         self.time_s: Floats = np.zeros(replicas)
-        self.collided: Bools = np.zeros(replicas, bool)
+        self.has_claimed: Bools = np.zeros((replicas, 2), bool)
         self.collision: list[Collision | None] = [None] * replicas
-        self._pose: Pose | None = None  # of the egos, once somebody has asked for it since they moved
         self._index: dict[str, int] = {}  # of each vehicle's slot: replica * 12 + slot; so numbered are also these:
         self._stage = np.zeros(replicas * MAX_VEHICLES, np.int64)  # which of its lane's three SUMO lanes it is on
         self._lane_pos_m: Floats = np.zeros(replicas * MAX_VEHICLES)
         self._last_slot = np.full((replicas, 2), _EMPTY)  # of the vehicle that entered each lane last
         self._was_present: Bools = np.zeros(slots, bool)  # at the previous step; such a slot takes no new vehicle yet
         self._distance_m: Floats = np.full(slots, np.inf)  # from the ego; infinite if far
+        self._was_distance_m: Floats = np.full(slots, np.inf)  # a step ago
         self._unsafe: Bools = np.zeros(replicas, bool)  # what the safety check says for the next step
-        self._claims: Bools = np.zeros((replicas, 2), bool)
+        self._hit_slot = np.full(replicas, _EMPTY)  # of the vehicle the ego collided with
+        self._claim_changed: Bools = np.zeros((replicas, 2), bool)
         self._ids: list[list[str]] = [[""] * MAX_VEHICLES for _ in range(replicas)]
         self._ego_ids = [""] * replicas
         self._episodes = [0] * replicas
@@ -178,6 +181,7 @@ class Intersections:
         self._streams: list[tuple[DriverStream, ...]] = [() for _ in range(replicas)]
         self._wanted_gap_m: Floats = np.full((replicas, 2), np.inf)
         self._wanted_time_s: Floats = np.zeros((replicas, 2))
+        self._admitted: Bools = np.zeros((replicas, 2), bool)
 
         self._connection = _start(replicas, scenario, backend, collision_options)
         self._finalizer = weakref.finalize(self, self._connection.close)
@@ -192,14 +196,9 @@ class Intersections:
         return np.asarray(self._yields[self.member])
 
     @property
-    def has_claimed(self) -> Bools:
-        """Which lanes (lower, upper) the ego claims now; (R, 2)."""
-        return self._claims
-
-    def ego_pose(self) -> Pose:
-        if self._pose is None:
-            self._pose = self.path.pose(self.ego_front_m)
-        return self._pose
+    def collided(self) -> Bools:
+        """Whether the ego has had a collision in the episode; (R,)."""
+        return np.asarray(self._hit_slot != _EMPTY)
 
     def close(self) -> None:
         """End the simulation; safe to call twice."""
@@ -233,9 +232,9 @@ class Intersections:
         self._episodes[replica] += 1
         self._vehicle_count[replica] = 0
         self.time_s[replica] = 0.0
-        self.collided[replica] = False
         self.collision[replica] = None
-        self._claims[replica] = False
+        self._hit_slot[replica] = _EMPTY
+        self.has_claimed[replica] = False
         for slot, vehicle in enumerate(vehicles):
             self._add(replica, slot, vehicle)
         if self._with_ego:
@@ -266,7 +265,7 @@ class Intersections:
         self._ego_ids[replica] = ego_id
         self.ego_front_m[replica] = front_m
         self.ego_speed_mps[replica] = 0.0
-        self._pose = None
+        self._place_egos()
 
     def _add(self, replica: int, slot: int, placed: PlacedVehicle) -> None:
         lane, member = placed.lane, self.population[placed.member]
@@ -287,7 +286,7 @@ class Intersections:
         if not member.profile.yields:
             vehicle.setParameter(vehicle_id, _IGNORE_AS_LEADER, EGO_TYPE)
         vehicle.setParameter(vehicle_id, _IGNORE_ON_JUNCTION, EGO_TYPE)
-        if member.profile.yields and self._claims[replica, lane]:
+        if member.profile.yields and self.has_claimed[replica, lane]:
             self._set_yielding(vehicle_id, placed.member, True)
         self._ids[replica][slot] = vehicle_id
         index = replica * MAX_VEHICLES + slot
@@ -299,7 +298,7 @@ class Intersections:
         self._stage[index] = stage
         self._lane_pos_m[index] = position_m
         self.front_m[replica, slot] = self._stage_start_m[lane, stage] + position_m
-        self.x_m[replica, slot] = self._centre_x_m(self.front_m[replica, slot], lane)
+        self.x_m[replica, slot] = centre_x_m(placed.front_m, lane, *self._lengths_m)
         self.y_m[replica, slot] = self._lane_y_m[lane]
         self._last_slot[replica, lane] = index
 
@@ -320,7 +319,7 @@ class Intersections:
         """Advance all replicas by one step; (R,) desired speeds of the egos, none without egos."""
         if desired_speed_mps is not None:
             self._drive_egos(desired_speed_mps)
-        self._was_present[:] = self.present
+        np.copyto(self._was_present, self.present)
         self._connection.step()
         self.time_s += self.scenario.episode.step_s
         for vehicle_id in self._connection.simulation.getArrivedIDList():
@@ -330,61 +329,57 @@ class Intersections:
                 self._ego_ids[self._ego_ids.index(vehicle_id)] = ""
         self._read_positions()
         if self._with_ego:
-            self._measure_distances()
+            self._check_safety()
         self._admit()
 
     def _drive_egos(self, desired_speed_mps: Floats) -> None:
-        controller, step_s = self.scenario.ego, self.scenario.episode.step_s
         self._update_claims()
-        accel = ego_control.acceleration_mps2(self.ego_speed_mps, desired_speed_mps, self._unsafe, controller)
-        self.ego_speed_mps = np.maximum(self.ego_speed_mps + accel * step_s, 0.0)
-        self.ego_front_m = self.ego_front_m + self.ego_speed_mps * step_s
-        self._pose = None
+        drive(desired_speed_mps, self._unsafe, self._ego_rules, self.ego_speed_mps, self.ego_front_m)
+        self._place_egos()
         set_speed = self._connection.vehicle.setSpeed
         for ego_id, speed_mps in zip(self._ego_ids, self.ego_speed_mps.tolist(), strict=True):
             if ego_id:
                 set_speed(ego_id, speed_mps)
 
-    def _measure_distances(self) -> None:
-        """Run the safety check for the next step, and latch collisions, on vehicles within reach of the check."""
-        controller, shape, pose = self.scenario.ego, self.scenario.vehicle, self.ego_pose()
-        is_near = self.present & (np.abs(self.x_m - pose.x_m[:, None]) < self._watch_x_m)
-        is_near &= np.abs(self.y_m - pose.y_m[:, None]) < self._watch_y_m
-        near = np.nonzero(is_near)
-        before_m = self._distance_m[near]
-        self._distance_m.fill(np.inf)
-        self._unsafe.fill(False)
-        if len(near[0]):
-            at = (near[0], near[1], None)
-            distance_m = box_distance_m(pose.of(near[0]), self.x_m[at], self.y_m[at], shape)[:, 0]
-            approach_m = np.where(np.isfinite(before_m), before_m, distance_m) - distance_m
-            self._distance_m[near] = distance_m
-            is_unsafe = ego_control.is_unsafe(distance_m, approach_m / self.scenario.episode.step_s, controller)
-            self._unsafe[near[0][is_unsafe]] = True
-            for hit in np.flatnonzero(distance_m == 0.0):
-                self._latch_collision(int(near[0][hit]), int(near[1][hit]))
+    def _place_egos(self) -> None:
+        place(self.ego_front_m, self.path, self.ego_pose)
+
+    def _check_safety(self) -> None:
+        """Run the safety check for the next step, and latch collisions."""
+        shape = self.scenario.vehicle
+        self._distance_m, self._was_distance_m = self._was_distance_m, self._distance_m
+        measure_distances_m(
+            self.ego_pose,
+            self.present,
+            self.x_m,
+            self.y_m,
+            self._reach_m,
+            shape.length_m,
+            shape.width_m,
+            self._distance_m,
+        )
+        if check_safety(self._distance_m, self._was_distance_m, self._ego_rules, self._unsafe, self._hit_slot):
+            for replica in np.flatnonzero(self.collided).tolist():
+                self._latch_collision(replica, int(self._hit_slot[replica]))
 
     def _latch_collision(self, replica: int, slot: int) -> None:
-        if self.collided[replica]:
-            return
-        pose = self.ego_pose()
-        self.collided[replica] = True
-        self.collision[replica] = Collision(
-            slot,
-            self.population[self.member[replica, slot]].profile.name,
-            LANE_NAMES[self.lane[replica, slot]],
-            float(pose.x_m[replica]),
-            float(pose.y_m[replica]),
-        )
+        if self.collision[replica] is None:
+            self.collision[replica] = Collision(
+                slot,
+                self.population[self.member[replica, slot]].profile.name,
+                LANE_NAMES[self.lane[replica, slot]],
+                float(self.ego_pose["x_m"][replica]),
+                float(self.ego_pose["y_m"][replica]),
+            )
 
     def _update_claims(self) -> None:
-        pose = self.ego_pose()
-        towards_mps = self.ego_speed_mps * pose.front_direction_y
-        now = ego_control.claims(pose.front_y_m, towards_mps, self.scenario.claim, self.scenario.street)
-        for replica, lane in _where(now != self._claims):
+        changed = self._claim_changed
+        if not update_claims(self.ego_pose, self.ego_speed_mps, self._ego_rules, self.has_claimed, changed):
+            return
+        for replica, lane in _where(changed):
+            claimed = bool(self.has_claimed[replica, lane])
             for slot in np.flatnonzero(self.yields[replica] & (self.lane[replica] == lane)):
-                self._set_yielding(self._ids[replica][slot], self.member[replica, slot], bool(now[replica, lane]))
-        self._claims = now
+                self._set_yielding(self._ids[replica][slot], self.member[replica, slot], claimed)
 
     def _set_yielding(self, vehicle_id: str, member: int, yielding: bool) -> None:
         vehicle = self._connection.vehicle
@@ -396,24 +391,32 @@ class Intersections:
         count = len(self._index)
         slots = np.fromiter(self._index.values(), np.int64, count)
         position_m = np.fromiter(map(self._connection.vehicle.getLanePosition, self._index), float, count)
-        # Vehicles only move forward: a lane position that dropped belongs to the next SUMO lane.
-        self._stage[slots] += position_m < self._lane_pos_m[slots]
-        self._lane_pos_m[slots] = position_m
-        stage_start_m = self._stage_start_m[self.lane.reshape(-1)[slots], self._stage[slots]]
-        self.front_m.reshape(-1)[slots] = stage_start_m + position_m
-        self.x_m = self._centre_x_m(self.front_m, self.lane)
-
-    def _centre_x_m(self, front_m: Floats, lane: NDArray[np.int64] | int) -> Floats:
-        return centre_x_m(front_m, lane, self.scenario.street, self.scenario.vehicle)
+        locate(
+            slots,
+            position_m,
+            self.lane.reshape(-1),
+            self._stage_start_m,
+            *self._lengths_m,
+            self._stage,
+            self._lane_pos_m,
+            self.front_m.reshape(-1),
+            self.x_m.reshape(-1),
+        )
 
     def _admit(self) -> None:
         """Let the upcoming drivers in where there is room, a free slot, and their time has come."""
         entry_m = self.scenario.vehicle.length_m
-        last_m = self.front_m.reshape(-1)[self._last_slot]
-        gap_m = np.where(self._last_slot == _EMPTY, _OPEN_ROAD_M, last_m - self.scenario.vehicle.length_m - entry_m)
-        # A replica without an episode wants an infinite gap.
-        admitted = (gap_m >= self._wanted_gap_m) & (self.time_s[:, None] >= self._wanted_time_s)
-        for replica, lane in _where(admitted):
+        if not admit(
+            self.front_m.reshape(-1),
+            self._last_slot,
+            2 * entry_m,
+            self._wanted_gap_m,
+            self.time_s,
+            self._wanted_time_s,
+            self._admitted,
+        ):
+            return
+        for replica, lane in _where(self._admitted):
             free = np.flatnonzero(~(self.present[replica] | self._was_present[replica]))
             if len(free):
                 driver = self._streams[replica][lane].take()

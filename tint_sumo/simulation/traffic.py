@@ -4,10 +4,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tint_sumo.compiling import compiled
 from tint_sumo.config import Scenario
 from tint_sumo.scenario.drivers import DriverMember
-from tint_sumo.scenario.geometry import lane_length_m
+from tint_sumo.scenario.geometry import Bools, Floats, lane_length_m
 
 
 @dataclass(frozen=True)
@@ -64,3 +66,38 @@ class DriverStream:
             follower = self.upcoming
             waited_m = follower.wait_s * pool.population[follower.member].desired_speed_mps
             front_m -= length_m + follower.gap_m + waited_m
+
+
+@compiled
+def admit(
+    front_m: Floats,
+    last_slot: NDArray[np.int64],
+    taken_m: float,
+    wanted_gap_m: Floats,
+    time_s: Floats,
+    wanted_time_s: Floats,
+    admitted: Bools,
+) -> bool:
+    """Tell for whom there is room, and whose time has come.
+
+    Args:
+        front_m: (S,) of vehicles along their lanes.
+        last_slot: (R, 2) of the vehicle that entered each lane last, index into ``front_m``; -1 for an open road.
+        taken_m: of that front's distance by its own vehicle and by the one that would enter.
+        wanted_gap_m, wanted_time_s: (R, 2) of the upcoming drivers; an infinite gap keeps a lane closed.
+        time_s: (R,).
+        admitted: (R, 2) written.
+
+    Returns:
+        whether anybody is admitted.
+    """
+    any_admitted = False
+    for row in range(len(time_s)):
+        for lane in range(last_slot.shape[1]):
+            last = last_slot[row, lane]
+            has_room = wanted_gap_m[row, lane] < np.inf and (
+                last < 0 or front_m[last] - taken_m >= wanted_gap_m[row, lane]
+            )
+            admitted[row, lane] = has_room and time_s[row] >= wanted_time_s[row, lane]
+            any_admitted = any_admitted or admitted[row, lane]
+    return any_admitted

@@ -1,0 +1,20 @@
+"""Functions of numbers and arrays compiled to machine code (Numba), for what is done in every step.
+
+A compiled function may use only functions and constants of its own file, and takes all else as arguments: Numba keeps
+the machine code beside that file and makes it anew when that file changes, and when no other does.
+"""
+
+from collections.abc import Callable
+from typing import TypeVar, cast
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., object])
+
+
+def compiled(function: F) -> F:
+    """Compile a function when it is first called, and keep the machine code for other processes where files can be."""
+    try:
+        return cast(F, numba.njit(cache=True)(function))
+    except RuntimeError:  # neither beside the file nor in the user's cache folder
+        return cast(F, numba.njit(function))

@@ -33,10 +33,13 @@ def test_the_benchmark_measures_everything() -> None:
         "encode_ms",
         "breakdown_us",
     }
-    assert printed["cores"].keys() == {"one", "two", "ratio"}
+    assert [cores["replicas"] for cores in printed["cores"]] == [4, 8]
+    for cores in printed["cores"]:
+        assert cores.keys() == {"replicas", "one", "two", "ratio"}
+        assert min(cores.values()) > 0.0
     assert printed["breakdown_us"].keys() == PARTS
     speeds = [printed[key] for key in printed if key.endswith("steps_per_s")]
-    assert min(speeds + list(printed["breakdown_us"].values()) + list(printed["cores"].values())) > 0.0
+    assert min(speeds + list(printed["breakdown_us"].values())) > 0.0
     for part in ("train_windows_per_s", "encode_ms"):
         assert printed[part].keys() == METHODS.keys()
         assert min(printed[part].values()) > 0.0

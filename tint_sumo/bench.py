@@ -11,8 +11,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -26,6 +27,7 @@ from tint_sumo.config import MAX_VEHICLES, WINDOW_STEPS
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.processes import SPAWN, end_with_parent
 from tint_sumo.progress import make_bar
 from tint_sumo.simulation.intersections import SUMO_COLLISION_CHECK, Intersections
 from tint_sumo.study.budgets import TRAIT_BUDGETS
@@ -37,6 +39,7 @@ BREAKDOWN_METHOD = "clocks around the named functions in a pass of its own, thei
 _MIB = 2**20
 _WARM_UP_STEPS = 100  # of all replicas: their episodes begin together and drift apart
 _BARE_STEPS = 10  # of SUMO alone: one second, in which few vehicles leave and none would enter
+_CORES_TURNS = 3  # for each of the other measurements: whether two processes run at once depends on what else runs
 _RECORD_WORKERS = 2
 _SAMPLING_S = 0.05
 _ENCODED = 64 * MAX_VEHICLES
@@ -67,11 +70,19 @@ QUICK = Sizes(
 
 @dataclass(frozen=True)
 class Cores:
-    """Environment steps per second with the replicas in one process and in two workers."""
+    """Environment steps per second with all replicas in one process, and shared out among two workers."""
 
+    replicas: int
     one: float
     two: float
     ratio: float
+
+    def rows(self) -> list[tuple[str, str]]:
+        return [
+            (f"{self.replicas} replicas in one process", f"{self.one:,.0f} environment steps/s"),
+            ("  in two workers", f"{self.two:,.0f} environment steps/s"),
+            ("  their ratio", f"{self.ratio:.2f}"),
+        ]
 
 
 @dataclass(frozen=True)
@@ -89,7 +100,7 @@ class Benchmark:
     checking_floor_env_steps_per_s: float
     env_to_checking_floor: float
     gym_env_steps_per_s: float
-    cores: Cores
+    cores: tuple[Cores, ...]
     record_windows_per_s: float
     peak_rss_mib: float  # of the recorder's processes together
     windows: int
@@ -110,9 +121,7 @@ class Benchmark:
             ("  its speed to SUMO's alone", f"{self.env_to_floor:.2f}"),
             ("  and with its collision check", f"{self.env_to_checking_floor:.2f}"),
             ("one gymnasium environment", f"{self.gym_env_steps_per_s:,.0f} steps/s"),
-            ("one process", f"{self.cores.one:,.0f} environment steps/s"),
-            ("two workers", f"{self.cores.two:,.0f} environment steps/s"),
-            ("  their ratio", f"{self.cores.ratio:.2f}"),
+            *(row for cores in self.cores for row in cores.rows()),
             (f"recorder, {_RECORD_WORKERS} workers", f"{self.record_windows_per_s:,.0f} windows/s"),
             ("  its processes' peak memory", f"{self.peak_rss_mib:,.0f} MiB"),
             ("memory growth while stepping", f"{self.memory_growth_mib:+.1f} MiB"),
@@ -293,11 +302,42 @@ def _gym_speed(sizes: Sizes) -> dict[str, Any]:
 
 
 def _cores(sizes: Sizes) -> dict[str, Any]:
-    """In turns: all replicas in this process, and shared out among two workers."""
-    with _driven(sizes) as one, _driven(sizes, workers=2) as two:
-        speeds = [(one.steps_per_s(), two.steps_per_s()) for _ in range(sizes.turns)]
+    """The usual number of replicas, and that number in each worker."""
+    return {"cores": tuple(_workers_speed(replace(sizes, replicas=times * sizes.replicas)) for times in (1, 2))}
+
+
+def _workers_speed(sizes: Sizes) -> Cores:
+    """In turns, each apart from this process."""
+    with _driven_apart(sizes, workers=1) as one, _driven_apart(sizes, workers=2) as two:
+        speeds = [(one(), two()) for _ in range(_CORES_TURNS * sizes.turns)]
     ratio = median(b / a for a, b in speeds)
-    return {"cores": Cores(median(a for a, _ in speeds), median(b for _, b in speeds), ratio)}
+    return Cores(sizes.replicas, median(a for a, _ in speeds), median(b for _, b in speeds), ratio)
+
+
+@contextmanager
+def _driven_apart(sizes: Sizes, workers: int) -> Iterator[Callable[[], float]]:
+    """A driven environment in a process of its own; call it for the steps per second of a turn."""
+    pipe, theirs = SPAWN.Pipe()
+    process = SPAWN.Process(target=_serve_turns, args=(theirs, sizes, workers))
+    process.start()
+    theirs.close()
+
+    def turn() -> float:
+        pipe.send("turn")
+        return float(pipe.recv())
+
+    try:
+        yield turn
+    finally:
+        pipe.close()
+        process.join()
+
+
+def _serve_turns(pipe: Connection, sizes: Sizes, workers: int) -> None:
+    end_with_parent()
+    with _driven(sizes, workers) as driven, suppress(EOFError):
+        while pipe.recv():
+            pipe.send(driven.steps_per_s())
 
 
 def _record(sizes: Sizes) -> dict[str, Any]:

@@ -25,7 +25,7 @@ PATIENCE_S = 30.0
 
 @pytest.fixture
 def vector() -> Iterator[TIntersectionVectorEnv]:
-    vector = TIntersectionVectorEnv(3, workers=2)
+    vector = TIntersectionVectorEnv(3, workers=3)
     yield vector
     vector.close()
 
@@ -139,9 +139,34 @@ def test_a_killed_worker_is_reported_and_ends_the_others(vector: TIntersectionVe
 
 
 def test_an_error_in_a_worker_reaches_the_caller(vector: TIntersectionVectorEnv) -> None:
-    with pytest.raises(RuntimeError, match=r"worker 1 failed:\n(?s:.*)Seed must be"):
+    with pytest.raises(RuntimeError, match=r"worker 2 failed:\n(?s:.*)Seed must be"):
         vector.reset(seed=[1, 2, -3])
     assert not worker_ids()
+
+
+def test_an_error_in_this_process_ends_the_workers(vector: TIntersectionVectorEnv) -> None:
+    with pytest.raises(gymnasium.error.Error, match="Seed must be"):
+        vector.reset(seed=[-1, 2, 3])
+    assert not worker_ids()
+    with pytest.raises(RuntimeError, match="closed; make a new one"):
+        vector.reset()
+
+
+def test_this_process_takes_part_unless_its_libsumo_is_taken() -> None:
+    first = TIntersectionVectorEnv(2, workers=2)
+    try:
+        assert len(worker_ids()) == 1
+        second = TIntersectionVectorEnv(2, workers=2)
+        try:
+            assert len(worker_ids()) == 3
+            assert_equal(first.reset(seed=0)[0], second.reset(seed=0)[0])
+        finally:
+            second.close()
+        assert len(worker_ids()) == 1
+        *_, infos = first.step(np.array([0, 1]))
+        assert infos["time_s"].tolist() == [0.1, 0.1]
+    finally:
+        first.close()
 
 
 def test_bad_actions_are_refused_before_any_worker_steps(vector: TIntersectionVectorEnv) -> None:
@@ -167,7 +192,7 @@ import numpy as np
 from tint_sumo.envs.vector import TIntersectionVectorEnv
 
 if __name__ == "__main__":
-    vector = TIntersectionVectorEnv(4, workers=2)
+    vector = TIntersectionVectorEnv(4, workers=3)
     vector.reset(seed=0)
     print(*(process.pid for process in multiprocessing.active_children()), flush=True)
     while True:

@@ -26,7 +26,9 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
     ``infos["final_info"]``. All other infos are arrays over the environments.
 
     With ``workers`` above 1 the environments are shared out among as many processes, with the same results; a script
-    that asks for them needs the usual ``if __name__ == "__main__":``.
+    that asks for them needs the usual ``if __name__ == "__main__":``. This process is one of them, unless another
+    environment of it uses libsumo already. Waiting processes are busy for a millisecond before they sleep, so more
+    workers than cores are no help.
     """
 
     metadata = {  # noqa: RUF012 - gymnasium's way

@@ -1,14 +1,17 @@
-"""A batch of environments spread over worker processes, each with a simulation of its own.
+"""A batch of environments shared out among processes, each with a simulation of its own.
 
-Actions, observations and rewards pass through shared memory; the pipes carry a word per step, and whatever there is to
+What the environments tell after a step lies in shared memory; the pipes carry the actions, and whatever there is to
 tell of episodes that ended.
 """
 
+import os
+import pickle
+import time
 import traceback
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Any
@@ -21,39 +24,45 @@ from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import ROW, Rows
 from tint_sumo.errors import InputError
 from tint_sumo.processes import SPAWN, end_with_parent, interrupts_blocked
+from tint_sumo.simulation.connection import libsumo_is_free
 
 _ENDING_S = 10.0  # more than enough for a step, and to close a simulation
+_LOOK_OUT_S = 1e-3  # about a step; to be put to sleep and woken up again costs a good part of one
+_INTEGER = np.dtype(np.int64)
 
 
 class WorkerBatch:
     """``num_envs`` environments shared out among ``workers`` processes, in order and as evenly as can be.
 
-    An error in a worker, its death, or an interruption while waiting ends all of them.
+    The first of them is this process, which would have nothing else to do while the others step; unless it already runs
+    a simulation of its own, since libsumo holds one per process. An error in one of them, its death, or an interruption
+    ends all the others.
     """
 
     def __init__(self, num_envs: int, settings: TaskSettings, workers: int) -> None:
-        self._actions, self.rows, memory = _shared(num_envs)
+        shared = _Shared(num_envs, workers)
         bounds = [num_envs * worker // workers for worker in range(workers + 1)]
         self._shares = [slice(*share) for share in pairwise(bounds)]
-        self._pipes: list[Connection] = []
-        self._processes: list[Any] = []
-        self._finalizer = weakref.finalize(self, _end, self._pipes, self._processes)
-        for share in self._shares:
-            pipe, theirs = SPAWN.Pipe()
-            process = SPAWN.Process(target=_serve, args=(theirs, memory, num_envs, share, settings), daemon=True)
-            with interrupts_blocked():
-                process.start()
-            theirs.close()
-            self._pipes.append(pipe)
-            self._processes.append(process)
-        self._listen()
+        self.rows = shared.rows
+        self._local: LocalBatch | None = None
+        self._helpers: list[_Helper] = []
+        self._finalizer = weakref.finalize(self, _end, self._helpers)
+        takes_part = settings.backend == "traci" or libsumo_is_free()
+        try:
+            for worker in range(int(takes_part), workers):
+                self._helpers.append(_start(worker, shared, self._shares[worker], settings))
+            if takes_part:
+                self._local = LocalBatch(self._shares[0].stop, settings, self.rows[self._shares[0]])
+            self._listen()
+        except BaseException:
+            self.close()
+            raise
 
     def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> None:
-        self._ask(*(("reset", seeds[share], mask[share]) for share in self._shares))
+        self._ask("reset", lambda share: (seeds[share], mask[share]))
 
     def step(self, actions: NDArray[np.integer]) -> list[Ended]:
-        self._actions[:] = actions
-        answers = self._ask(*(("step",) for _ in self._shares))
+        answers = self._ask("step", lambda share: (actions[share],))
         return [
             replace(one, index=one.index + share.start)
             for share, answer in zip(self._shares, answers, strict=True)
@@ -61,93 +70,143 @@ class WorkerBatch:
         ]
 
     def render(self) -> list[NDArray[np.uint8]]:
-        return [image for images in self._ask(*(("render",) for _ in self._shares)) for image in images]
+        return [image for images in self._ask("render", lambda _: ()) for image in images]
 
     def close(self) -> None:
+        if self._local is not None:
+            self._local.close()
         self._finalizer()
 
-    def _ask(self, *requests: tuple[Any, ...]) -> list[Any]:
-        """Send each worker its request and return their answers."""
+    def _ask(self, request: str, arguments: Callable[[slice], tuple[Any, ...]]) -> list[Any]:
+        """Call a method of every process's batch, with arguments for its share; their answers."""
         if not self._finalizer.alive:
             raise RuntimeError("the environment is closed; make a new one")
-        for pipe, request in zip(self._pipes, requests, strict=True):
-            with suppress(ConnectionError):  # a worker that has died is found out when it is listened to
-                pipe.send(request)
-        return self._listen()
-
-    def _listen(self) -> list[Any]:
         try:
-            return [self._answer(worker) for worker in range(len(self._pipes))]
+            for helper in self._helpers:
+                with suppress(ConnectionError):  # one that has died is found out when it is listened to
+                    helper.line.send((request, *arguments(helper.share)))
+            own = [] if self._local is None else [getattr(self._local, request)(*arguments(self._shares[0]))]
+            return own + self._listen()
         except BaseException:
             self.close()
             raise
 
-    def _answer(self, worker: int) -> Any:
+    def _listen(self) -> list[Any]:
+        return [helper.answer() for helper in self._helpers]
+
+
+@dataclass(frozen=True)
+class _Helper:
+    """Another process and its share of the environments."""
+
+    worker: int
+    share: slice
+    line: "_Line"
+    process: Any
+
+    def answer(self) -> Any:
         try:
-            kind, content = self._pipes[worker].recv()
+            kind, content = self.line.receive()
         except (EOFError, ConnectionError):
-            process = self._processes[worker]
-            process.join(_ENDING_S)
+            self.process.join(_ENDING_S)
             raise RuntimeError(
-                f"environment worker {worker} died with exit code {process.exitcode}; make a new environment"
+                f"environment worker {self.worker} died with exit code {self.process.exitcode}; make a new environment"
             ) from None
         if kind == "refused":
             raise InputError(content)
         if kind == "failed":
-            raise RuntimeError(f"environment worker {worker} failed:\n{content}")
+            raise RuntimeError(f"environment worker {self.worker} failed:\n{content}")
         return content
 
 
-def _shared(num_envs: int, memory: Any = None) -> tuple[NDArray[np.int64], Rows, Any]:
-    """Actions (N,), rows (N,) of the environments, and the shared memory they lie in, new if none is given.
+def _start(worker: int, shared: "_Shared", share: slice, settings: TaskSettings) -> _Helper:
+    pipe, theirs = SPAWN.Pipe()
+    process = SPAWN.Process(target=_serve, args=(theirs, shared, worker, share, settings), daemon=True)
+    with interrupts_blocked():
+        process.start()
+    theirs.close()
+    return _Helper(worker, share, _Line(pipe, shared.sent[worker]), process)
 
-    The memory has no name in the file system: nothing is left of it when the last process ends, however it ends.
+
+def _end(helpers: list[_Helper]) -> None:
+    for helper in helpers:
+        helper.line.close()  # it ends when nobody is at the other end
+    for helper in helpers:
+        helper.process.join(_ENDING_S)
+        helper.process.kill()
+        helper.process.join()
+
+
+class _Shared:
+    """The memory that all processes see.
+
+    It has no name in the file system: nothing is left of it when the last process ends, however it ends.
     """
-    size = num_envs * np.dtype(np.int64).itemsize
-    if memory is None:
-        memory = SPAWN.RawArray("B", size + num_envs * ROW.itemsize)
-    actions = np.frombuffer(memory, np.int64, num_envs)
-    return actions, np.frombuffer(memory, ROW, num_envs, offset=size), memory
+
+    def __init__(self, num_envs: int, workers: int) -> None:
+        self._num_envs = num_envs
+        self._workers = workers
+        self._rows_at = 2 * workers * _INTEGER.itemsize
+        self._memory = SPAWN.RawArray("B", self._rows_at + num_envs * ROW.itemsize)
+
+    @property
+    def sent(self) -> NDArray[np.int64]:
+        """How many messages each worker has been sent, and has sent; (W, 2)."""
+        return np.frombuffer(self._memory, _INTEGER, 2 * self._workers).reshape(-1, 2)
+
+    @property
+    def rows(self) -> Rows:
+        return np.frombuffer(self._memory, ROW, self._num_envs, self._rows_at)
 
 
-def _end(pipes: list[Connection], processes: list[Any]) -> None:
-    for pipe in pipes:
-        pipe.close()  # a worker ends when nobody is at the other end
-    for process in processes:
-        process.join(_ENDING_S)
-        process.kill()
-        process.join()
+class _Line:
+    """One end of a pipe, whose receiver looks out for a message for a while before it goes to sleep.
+
+    Args:
+        sent: (2,) in shared memory: how many messages this end has sent, and the other.
+    """
+
+    def __init__(self, pipe: Connection, sent: NDArray[np.int64]) -> None:
+        self._pipe = pipe
+        self._sent = sent.data
+        self._received = 0
+
+    def send(self, message: Any) -> None:
+        self._pipe.send_bytes(pickle.dumps(message))  # Connection.send takes several times as long
+        self._sent[0] += 1
+
+    def receive(self) -> Any:
+        end_s = time.perf_counter() + _LOOK_OUT_S
+        while self._sent[1] <= self._received and time.perf_counter() < end_s:
+            os.sched_yield()
+        self._received += 1
+        return pickle.loads(self._pipe.recv_bytes())
+
+    def close(self) -> None:
+        self._pipe.close()
 
 
-def _serve(pipe: Connection, memory: Any, num_envs: int, share: slice, settings: TaskSettings) -> None:
-    """The worker process."""
+def _serve(pipe: Connection, shared: _Shared, worker: int, share: slice, settings: TaskSettings) -> None:
+    """A worker process."""
     end_with_parent()
+    line = _Line(pipe, shared.sent[worker, ::-1])
     with suppress(EOFError, ConnectionError):  # nobody is at the other end any more
         try:
-            _answer_requests(pipe, memory, num_envs, share, settings)
+            _answer_requests(line, shared, share, settings)
         except InputError as error:
-            pipe.send(("refused", str(error)))
+            line.send(("refused", str(error)))
         except (EOFError, ConnectionError):
             raise
         except Exception:
-            pipe.send(("failed", traceback.format_exc()))
+            line.send(("failed", traceback.format_exc()))
 
 
-def _answer_requests(pipe: Connection, memory: Any, num_envs: int, share: slice, settings: TaskSettings) -> None:
-    actions, rows, _ = _shared(num_envs, memory)
-    actions, rows = actions[share], rows[share]
-    batch = LocalBatch(len(rows), settings, rows)
+def _answer_requests(line: _Line, shared: _Shared, share: slice, settings: TaskSettings) -> None:
+    batch = LocalBatch(share.stop - share.start, settings, shared.rows[share])
     try:
-        pipe.send(("ready", None))
+        line.send(("ready", None))
         while True:
-            request, *arguments = pipe.recv()
-            answer: Any = None
-            if request == "reset":
-                batch.reset(*arguments)
-            elif request == "step":
-                answer = batch.step(actions)
-            else:
-                answer = batch.render()
-            pipe.send(("done", answer))
+            request, *arguments = line.receive()
+            line.send(("done", getattr(batch, request)(*arguments)))
     finally:
         batch.close()

@@ -45,10 +45,15 @@ def connect(options: Sequence[str], backend: Backend = "auto") -> Connection:
     """
     if backend not in ("auto", "libsumo", "traci"):
         raise InputError(f"unknown backend {backend!r}; choose auto, libsumo or traci")
-    busy = os.getpid() in _libsumo_owner
+    busy = not libsumo_is_free()
     if backend == "libsumo" and busy:
         raise InputError("libsumo already runs a simulation in this process; close it first or use backend='traci'")
     return _traci(options) if backend == "traci" or busy else _libsumo(options)
+
+
+def libsumo_is_free() -> bool:
+    """Whether this process can start a simulation in libsumo."""
+    return os.getpid() not in _libsumo_owner
 
 
 def _libsumo(options: Sequence[str]) -> Connection:
@@ -56,7 +61,7 @@ def _libsumo(options: Sequence[str]) -> Connection:
     _libsumo_owner[:] = [os.getpid()]
 
     def close() -> None:
-        if os.getpid() in _libsumo_owner:
+        if not libsumo_is_free():
             _libsumo_owner.clear()
             libsumo.close()
 

@@ -7,6 +7,7 @@ per-vehicle call into SUMO each step reads its lane position.
 
 import tempfile
 import weakref
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,6 +146,7 @@ class Intersections:
         self._yields = np.array([*(member.profile.yields for member in self.population), False])  # the last: empty
         self._lane_y_m = lane_y_m(scenario.street)
         self._stage_start_m = stage_start_m(scenario.street, scenario.vehicle)
+        self._stage_starts_m = self._stage_start_m.tolist()
         self._lengths_m = (scenario.street.half_length_m, scenario.vehicle.length_m)
 
         # Of the safety check, which needs to know how far away a vehicle was a step before.
@@ -272,8 +274,9 @@ class Intersections:
         number = self._vehicle_count[replica]
         self._vehicle_count[replica] += 1
         vehicle_id = f"{replica}.{self._episodes[replica]}.{number}"
-        stage = int(np.searchsorted(self._stage_start_m[lane], placed.front_m, side="right")) - 1
-        position_m = placed.front_m - self._stage_start_m[lane, stage]
+        starts_m = self._stage_starts_m[lane]
+        stage = bisect_right(starts_m, placed.front_m) - 1
+        position_m = placed.front_m - starts_m[stage]
         vehicle = self._connection.vehicle
         vehicle.add(
             vehicle_id,
@@ -297,7 +300,7 @@ class Intersections:
         self.vehicle_number[replica, slot] = number
         self._stage[index] = stage
         self._lane_pos_m[index] = position_m
-        self.front_m[replica, slot] = self._stage_start_m[lane, stage] + position_m
+        self.front_m[replica, slot] = placed.front_m
         self.x_m[replica, slot] = centre_x_m(placed.front_m, lane, *self._lengths_m)
         self.y_m[replica, slot] = self._lane_y_m[lane]
         self._last_slot[replica, lane] = index

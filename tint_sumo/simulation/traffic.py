@@ -48,7 +48,8 @@ class DriverStream:
         rng, pool, traffic = self._rng, self._pool, self._pool.scenario.traffic
         candidates = pool.by_trait[bool(rng.random() < traffic.p_conservative)]
         member = candidates[int(rng.integers(len(candidates)))]
-        gap_m = rng.uniform(*pool.population[member].profile.entry_gap_m)
+        low_m, high_m = pool.population[member].profile.entry_gap_m
+        gap_m = low_m + (high_m - low_m) * rng.random()
         wait_s = 0.0 if traffic.arrivals_per_s is None else rng.exponential(1.0 / traffic.arrivals_per_s)
         return Driver(member, gap_m, wait_s)
 

@@ -88,7 +88,7 @@ class Episodes:
         self._scales = Scales(POSITION_SCALE_M, SPEED_SCALE_MPS, settings.scenario.episode.step_s)
         self._speeds_mps = np.array(_ACTIONS_MPS)
         self.steps = np.zeros(num_envs, np.int64)
-        self._noise = [np.random.default_rng(0) for _ in range(num_envs)]
+        self._noise: dict[int, np.random.Generator] = {}  # of each environment, where there is noise
         self._noise_m: Floats = np.zeros((num_envs, MAX_VEHICLES, 2))
 
     def begin(self, index: int, rng: np.random.Generator) -> None:
@@ -96,7 +96,8 @@ class Episodes:
         seed = int(rng.integers(_SEED_LIMIT))
         self.simulation.reset(index, seed)
         self.steps[index] = 0
-        self._noise[index] = np.random.default_rng([seed, 1])
+        if self.settings.position_noise_m > 0.0:
+            self._noise[index] = np.random.default_rng([seed, 1])
         self._observe(slice(index, index + 1))
 
     def step(self, actions: NDArray[np.integer]) -> bool:

@@ -13,6 +13,7 @@ Observation = dict[str, NDArray[np.float32]]
 OBSERVATION_KEYS = ("ego", "vehicles", "mask")
 REWARD_TERMS = ("goal", "collision", "speed", "step")
 OUTCOMES = ("", "success", "collision", "timeout")
+_GOING_ON, _SUCCESS, _COLLISION, _TIMEOUT = range(4)
 BOUND = 2.0  # of normalised observations: 40 m, 6 m/s
 
 ROW = np.dtype(
@@ -74,14 +75,20 @@ def judge(
     for index in range(len(rows)):
         row, pose = rows[index], poses[index]
         arrived = pose.x_m > rules.goal_x_m and abs(pose.y_m - rules.goal_y_m) < rules.goal_margin_m
-        row.outcome = 2 if collided[index] else 1 if arrived else 3 if steps[index] >= rules.step_limit else 0
-        row.terminated, row.truncated = row.outcome in (1, 2), row.outcome == 3
-        row.goal = rules.goal if row.outcome == 1 else 0.0
-        row.collision = rules.collision if row.outcome == 2 else 0.0
+        if collided[index]:
+            row.outcome = _COLLISION
+        elif arrived:
+            row.outcome = _SUCCESS
+        else:
+            row.outcome = _TIMEOUT if steps[index] >= rules.step_limit else _GOING_ON
+        row.terminated = row.outcome in (_SUCCESS, _COLLISION)
+        row.truncated = row.outcome == _TIMEOUT
+        row.goal = rules.goal if row.outcome == _SUCCESS else 0.0
+        row.collision = rules.collision if row.outcome == _COLLISION else 0.0
         row.speed = 0.0 if row.terminated else rules.speed_weight_per_mps * speed_mps[index]
         row.step = 0.0 if row.terminated else rules.step
         row.reward = row.goal + row.collision + row.speed + row.step
-        any_ended = any_ended or row.outcome > 0
+        any_ended = any_ended or row.outcome != _GOING_ON
     return any_ended
 
 

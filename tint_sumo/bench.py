@@ -51,7 +51,7 @@ class Sizes:
 
     replicas: int = 64
     turns: int = 9
-    turn_steps: int = 300
+    turn_steps: int = 100
     gym_turn_steps: int = 1_000  # of the single environment
     windows: int = 100_000
     training_windows: int = 40_000
@@ -60,7 +60,7 @@ class Sizes:
 
 QUICK = Sizes(
     turns=3,
-    turn_steps=100,
+    turn_steps=50,
     gym_turn_steps=500,
     windows=10_000,
     training_windows=5_000,

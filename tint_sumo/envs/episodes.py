@@ -112,10 +112,10 @@ class Episodes:
 
     def _observe(self, envs: slice) -> None:
         """Write the observations of some environments, each with noise from its own generator."""
-        simulation, sigma_m = self.simulation, self.settings.position_noise_m
-        if sigma_m > 0.0:
-            for index in range(envs.start, envs.stop):
-                self._noise_m[index] = self._noise[index].normal(0.0, sigma_m, (MAX_VEHICLES, 2))
+        simulation = self.simulation
+        for index in self._noise.keys() & range(envs.start, envs.stop):
+            rng = self._noise[index]
+            self._noise_m[index] = rng.normal(0.0, self.settings.position_noise_m, (MAX_VEHICLES, 2))
         observe(
             simulation.ego_pose[envs],
             simulation.ego_speed_mps[envs],

@@ -4,7 +4,7 @@ VENV ?= .venv
 TORCH ?=
 BIN := $(VENV)/bin
 
-.PHONY: install study test lint net clean
+.PHONY: install study test net clean
 
 install: $(VENV)/.installed
 

@@ -232,7 +232,7 @@ class InferTraits(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class StudyTraits(Command):
-    """Compare all trait methods at every position noise, an hour's work; the same command resumes an one."""
+    """Compare all trait methods at every position noise, an hour's work; the same command resumes it."""
 
     after_interrupt: ClassVar[str] = RESUMES
 

@@ -73,11 +73,9 @@ def gaps_m(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None = No
     number = np.arange(len(names)) if lanes is None else lanes.numbers(rows["lane"].cat.categories)
     lane, pos_m = number[rows["lane"].cat.codes], rows["pos_m"].to_numpy()
     when = np.unique(rows["time_s"], return_inverse=True)[1] * len(names)
-    order = np.lexsort((pos_m, when + lane))
-    queue, queue_m = (
-        (when + lane)[order],
-        pos_m[order],
-    )  # each lane at each time, from the rearmost vehicle to the first
+    place = when + lane
+    order = np.lexsort((pos_m, place))
+    queue, queue_m = place[order], pos_m[order]  # each lane at each time, from the rearmost vehicle to the first
 
     distance_m = np.full(len(rows), np.nan)
     distance_m[order[:-1]] = np.where(queue[1:] == queue[:-1], np.diff(queue_m), np.nan)

@@ -40,9 +40,8 @@ class TraitAccuracy:
     knn_accuracy: float  # of the nearest neighbours in the latent space
     windows: int
     error_m: float | None  # root mean square of reconstructed or predicted positions; None if the method has none
-    errors_in_most_uncertain_tenth: (
-        float | None
-    )  # share of the linear classifier's errors; None without errors or with point estimates
+    # Share of the linear classifier's errors; None without errors or with point estimates.
+    errors_in_most_uncertain_tenth: float | None
     by_length: Mapping[str, Part]  # keyed "2-5", "6-10", "11-19", "20"
     by_leader: Mapping[str, Part]  # keyed "with_leader", "without_leader"
 

@@ -27,7 +27,7 @@ from tint_sumo.config import MAX_VEHICLES, WINDOW_STEPS
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.sb3 import TIntersectionVecEnv
-from tint_sumo.processes import SPAWN, end_with_parent
+from tint_sumo.processes import start_worker
 from tint_sumo.progress import make_bar
 from tint_sumo.simulation.intersections import SUMO_COLLISION_CHECK, Intersections
 from tint_sumo.study.budgets import TRAIT_BUDGETS
@@ -317,10 +317,7 @@ def _workers_speed(sizes: Sizes) -> Cores:
 @contextmanager
 def _driven_apart(sizes: Sizes, workers: int) -> Iterator[Callable[[], float]]:
     """A driven environment in a process of its own; call it for the steps per second of a turn."""
-    pipe, theirs = SPAWN.Pipe()
-    process = SPAWN.Process(target=_serve_turns, args=(theirs, sizes, workers))
-    process.start()
-    theirs.close()
+    pipe, process = start_worker(_serve_turns, sizes, workers, daemon=False)
 
     def turn() -> float:
         pipe.send("turn")
@@ -334,7 +331,6 @@ def _driven_apart(sizes: Sizes, workers: int) -> Iterator[Callable[[], float]]:
 
 
 def _serve_turns(pipe: Connection, sizes: Sizes, workers: int) -> None:
-    end_with_parent()
     with _driven(sizes, workers) as driven, suppress(EOFError):
         while pipe.recv():
             pipe.send(driven.steps_per_s())

@@ -3,21 +3,34 @@
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from multiprocessing import connection, get_context, parent_process
+from typing import Any
 
 SPAWN = get_context("spawn")  # a forked child would share a running libsumo
 
 
-@contextmanager
-def interrupts_blocked() -> Iterator[None]:
-    """Processes started in this block never see Ctrl-C; the main process tells them to end."""
+def start_worker(
+    target: Callable[..., None], *arguments: Any, daemon: bool = True
+) -> tuple[connection.Connection, Any]:
+    """Start ``target(pipe, *arguments)`` in a process of its own; this end of the pipe, and the process.
+
+    It never sees Ctrl-C: the main process tells it to end. A daemon cannot start workers itself.
+    """
+    pipe, theirs = SPAWN.Pipe()
+    process = SPAWN.Process(target=_work, args=(target, theirs, *arguments), daemon=daemon)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        yield
+        process.start()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    theirs.close()
+    return pipe, process
+
+
+def _work(target: Callable[..., None], pipe: connection.Connection, *arguments: Any) -> None:
+    end_with_parent()
+    target(pipe, *arguments)
 
 
 def end_with_parent() -> None:

@@ -23,7 +23,7 @@ from tint_sumo.envs.batch import Ended, LocalBatch
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import ROW, Rows
 from tint_sumo.errors import InputError
-from tint_sumo.processes import SPAWN, end_with_parent, interrupts_blocked
+from tint_sumo.processes import SPAWN, start_worker
 from tint_sumo.simulation.connection import libsumo_is_free
 
 _ENDING_S = 10.0  # more than enough for a step, and to close a simulation
@@ -120,11 +120,7 @@ class _Helper:
 
 
 def _start(worker: int, shared: "_Shared", share: slice, settings: TaskSettings) -> _Helper:
-    pipe, theirs = SPAWN.Pipe()
-    process = SPAWN.Process(target=_serve, args=(theirs, shared, worker, share, settings), daemon=True)
-    with interrupts_blocked():
-        process.start()
-    theirs.close()
+    pipe, process = start_worker(_serve, shared, worker, share, settings)
     return _Helper(worker, share, _Line(pipe, shared.sent[worker]), process)
 
 
@@ -188,7 +184,6 @@ class _Line:
 
 def _serve(pipe: Connection, shared: _Shared, worker: int, share: slice, settings: TaskSettings) -> None:
     """A worker process."""
-    end_with_parent()
     line = _Line(pipe, shared.sent[worker, ::-1])
     with suppress(EOFError, ConnectionError):  # nobody is at the other end any more
         try:

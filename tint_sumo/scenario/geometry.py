@@ -40,7 +40,7 @@ def lane_length_m(street: Street, vehicle: VehicleShape) -> float:
 def centre_x_m(front_m: float, lane: int, half_length_m: float, vehicle_length_m: float) -> float:
     """x of a vehicle's centre, on a street of a half length."""
     along_m = front_m - vehicle_length_m - half_length_m  # from -20 at entry to 20 at exit
-    return along_m if lane == UPPER else -along_m
+    return float(LANE_DIRECTION[lane] * along_m)
 
 
 def junction_span_m(street: Street, vehicle: VehicleShape) -> Floats:

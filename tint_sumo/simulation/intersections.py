@@ -146,7 +146,6 @@ class Intersections:
         self._yields = np.array([*(member.profile.yields for member in self.population), False])  # the last: empty
         self._lane_y_m = lane_y_m(scenario.street)
         self._stage_start_m = stage_start_m(scenario.street, scenario.vehicle)
-        self._stage_starts_m = self._stage_start_m.tolist()
         self._lengths_m = (scenario.street.half_length_m, scenario.vehicle.length_m)
 
         # Of the safety check, which needs to know how far away a vehicle was a step before.
@@ -267,14 +266,15 @@ class Intersections:
         self._ego_ids[replica] = ego_id
         self.ego_front_m[replica] = front_m
         self.ego_speed_mps[replica] = 0.0
-        self._place_egos()
+        this = slice(replica, replica + 1)
+        place(self.ego_front_m[this], self.path, self.ego_pose[this])
 
     def _add(self, replica: int, slot: int, placed: PlacedVehicle) -> None:
         lane, member = placed.lane, self.population[placed.member]
         number = self._vehicle_count[replica]
         self._vehicle_count[replica] += 1
         vehicle_id = f"{replica}.{self._episodes[replica]}.{number}"
-        starts_m = self._stage_starts_m[lane]
+        starts_m = self._stage_start_m[lane].tolist()
         stage = bisect_right(starts_m, placed.front_m) - 1
         position_m = placed.front_m - starts_m[stage]
         vehicle = self._connection.vehicle
@@ -338,14 +338,11 @@ class Intersections:
     def _drive_egos(self, desired_speed_mps: Floats) -> None:
         self._update_claims()
         drive(desired_speed_mps, self._unsafe, self._ego_rules, self.ego_speed_mps, self.ego_front_m)
-        self._place_egos()
+        place(self.ego_front_m, self.path, self.ego_pose)
         set_speed = self._connection.vehicle.setSpeed
         for ego_id, speed_mps in zip(self._ego_ids, self.ego_speed_mps.tolist(), strict=True):
             if ego_id:
                 set_speed(ego_id, speed_mps)
-
-    def _place_egos(self) -> None:
-        place(self.ego_front_m, self.path, self.ego_pose)
 
     def _check_safety(self) -> None:
         """Run the safety check for the next step, and latch collisions."""

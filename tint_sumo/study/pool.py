@@ -12,7 +12,7 @@ from typing import Any, NoReturn, Protocol
 from tqdm import tqdm
 
 from tint_sumo.errors import InputError
-from tint_sumo.processes import SPAWN, end_with_parent, interrupts_blocked
+from tint_sumo.processes import start_worker
 from tint_sumo.progress import make_bar
 from tint_sumo.study.progress import Report
 
@@ -94,11 +94,7 @@ class _Worker:
         # Where bars cannot be redrawn in place, as in a log file, the global one is enough.
         hidden = not (progress and sys.stderr.isatty())
         self.bar: tqdm[NoReturn] = make_bar(desc=job.name, total=1, position=line, leave=False, disable=hidden)
-        self.pipe, theirs = SPAWN.Pipe(duplex=False)
-        self._process = SPAWN.Process(target=_work, args=(job, theirs), daemon=True)
-        with interrupts_blocked():
-            self._process.start()
-        theirs.close()
+        self.pipe, self._process = start_worker(_work, job)
 
     def listen(self) -> str | None:
         """Take one message; the job's closing line if it was the last.
@@ -133,10 +129,9 @@ class _Worker:
         self._process.kill()
 
 
-def _work(job: Job, pipe: Connection) -> None:
+def _work(pipe: Connection, job: Job) -> None:
     """The worker process."""
     signal.signal(signal.SIGTERM, _raise_interrupt)
-    end_with_parent()
 
     def report(*content: Any) -> None:
         pipe.send(("progress", content))

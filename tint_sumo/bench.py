@@ -331,7 +331,7 @@ def _driven_apart(sizes: Sizes, workers: int) -> Iterator[Callable[[], float]]:
 
 
 def _serve_turns(pipe: Connection, sizes: Sizes, workers: int) -> None:
-    with _driven(sizes, workers) as driven, suppress(EOFError):
+    with _driven(sizes, workers) as driven, suppress(EOFError, ConnectionError):  # nobody is at the other end
         while pipe.recv():
             pipe.send(driven.steps_per_s())
 

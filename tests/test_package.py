@@ -40,7 +40,7 @@ sys.meta_path = [finder for finder in sys.meta_path if type(finder).__module__ !
 import site
 site.addsitedir({str(tmp_path / "site")!r})
 import gymnasium
-env = gymnasium.make("tint_sumo/TIntersection-v0")
+env = gymnasium.make("tint_sumo/TIntersection-v1")
 env.reset(seed=0)
 import tint_sumo.files, tint_sumo.traits
 assert tint_sumo.__file__.startswith({str(tmp_path)!r}), tint_sumo.__file__

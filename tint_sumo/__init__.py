@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-ENV_ID = "tint_sumo/TIntersection-v0"
+ENV_ID = "tint_sumo/TIntersection-v1"
 
 
 def register_envs() -> None:

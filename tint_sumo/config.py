@@ -4,6 +4,7 @@ Sources: "paper" is Liu et al., Learning to Navigate Intersections with Unsuperv
 "code" is the authors' published code, used where the paper gives no value; "SUMO" is Eclipse SUMO's default.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -18,6 +19,7 @@ POSITION_SCALE_M = 20.0  # positions are observed divided by this (code)
 SPEED_SCALE_MPS = 3.0  # velocities are observed divided by this: the ego's top desired speed
 
 Backend = Literal["auto", "libsumo", "traci"]
+Share = float | tuple[float, float]  # a probability, or the range it is drawn from
 
 
 @dataclass(frozen=True)
@@ -91,16 +93,47 @@ class Population:
 POPULATIONS = {"traits": Population(), "continuous": Population((CONTINUOUS,), members=512)}
 
 
+def ends(share: Share) -> tuple[float, float]:
+    """Both ends of a range; twice the same for a number."""
+    low, high = share if isinstance(share, Sequence) else (share, share)
+    return float(low), float(high)
+
+
+def is_share(value: object) -> bool:
+    """Whether a value is a probability or a range of probabilities."""
+    try:
+        low, high = ends(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return False
+    return 0.0 <= low <= high <= 1.0
+
+
+def require_share(share: Share) -> None:
+    """Raise InputError unless this is a probability or a range of probabilities."""
+    if not is_share(share):
+        raise InputError(
+            f"p_conservative must be a probability in [0, 1], or two of them from low to high, not {share}"
+        )
+
+
 @dataclass(frozen=True)
 class Traffic:
     """How drivers appear on the street."""
 
-    p_conservative: float = 0.4  # probability that a driver is conservative
+    p_conservative: Share = 0.4  # probability that a driver is conservative; a range: drawn uniformly per episode
     arrivals_per_s: float | None = None  # Poisson rate per lane; None: saturated, enter as soon as there is room
 
+    @property
+    def p_conservative_range(self) -> tuple[float, float]:
+        """Lowest and highest probability."""
+        return ends(self.p_conservative)
+
+    @property
+    def mean_p_conservative(self) -> float:
+        return sum(self.p_conservative_range) / 2
+
     def __post_init__(self) -> None:
-        if not 0.0 <= self.p_conservative <= 1.0:
-            raise InputError(f"p_conservative is a probability and must lie in [0, 1], not {self.p_conservative}")
+        require_share(self.p_conservative)
         if self.arrivals_per_s is not None and not self.arrivals_per_s > 0.0:
             raise InputError(
                 f"arrivals_per_s must be positive, or None for saturated traffic, not {self.arrivals_per_s}"
@@ -123,15 +156,24 @@ class EgoController:
 
 @dataclass(frozen=True)
 class Claim:
-    """When the ego claims a lane, so that its yielding drivers react (code), and how much room they leave it.
+    """When the ego claims a lane, and which of its yielding drivers react to that.
 
-    Yielding drivers of the code stand 2 to 4 m behind the ego. With no more than their minGap from the vehicle ahead
-    they would come closer than the ego's safety check allows, and both would wait for ever.
+    The conditions of a claim are those of the code. A yielding driver reacts only if it can still stop where the ego
+    passes it at the distance that its safety check asks for; one that is too close drives on, as drivers do who are
+    too close to a traffic light that changes (Gazis, Herman and Maradudin 1960, Operations Research 8, 112-132). If it
+    braked all the same, it would stand so close to the ego's way that the safety check holds the ego, and both would
+    wait for ever.
     """
 
     approach_speed_mps: float = 0.5  # speed towards the lane that counts as moving in
     path_margin_m: float = 1.0  # front this far past the lane's border stands in the vehicles' path
     courtesy_gap_m: float = 1.5  # that yielding drivers add to their minGap while their lane is claimed
+    reaction_time_s: float = 0.1  # before a driver brakes: a step
+    braking_mps2: float = 6.0  # that a driver is ready for: hard, but below the 9 m/s2 of an emergency
+
+    def stopping_distance_m(self, speed_mps: float) -> float:
+        """Distance in which a driver at this speed is ready to stop."""
+        return speed_mps * self.reaction_time_s + speed_mps**2 / (2.0 * self.braking_mps2)
 
 
 @dataclass(frozen=True)

@@ -278,7 +278,10 @@ def test_rendering_shows_every_vehicle() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"p_conservative": 1.5}, r"must lie in \[0, 1\], not 1.5"),
+        ({"p_conservative": 1.5}, r"must be a probability in \[0, 1\], or two of them from low to high, not 1.5"),
+        ({"p_conservative": (0.6, 0.2)}, r"from low to high, not \(0.6, 0.2\)"),
+        ({"p_conservative": (0.1, 0.2, 0.3)}, "must be a probability"),
+        ({"tau_s": 0.0}, "tau_s must be at least a step of 0.1 s, and finite, not 0.0"),
         ({"reward": "mine"}, "unknown reward preset 'mine'; choose one of paper, authors"),
         ({"time_limit_s": 0.01}, "time_limit_s must be at least a step"),
         ({"time_limit_s": float("inf")}, "time_limit_s must be at least a step of 0.1 s, and finite"),

@@ -20,6 +20,7 @@ from tint_sumo.scenario.geometry import (
     path_point,
     place,
     stage_start_m,
+    swept_area_start_m,
 )
 
 SHAPE = VehicleShape()
@@ -93,3 +94,30 @@ def test_the_front_moves_by_path_length_and_along_the_tangent(front_m: float) ->
     assert math.hypot(x1 - x0, y1 - y0) == pytest.approx(step_m, rel=1e-3)
     if min(abs(front_m - PATH.turn_start_m), abs(front_m - PATH.turn_end_m)) > step_m:  # the turn begins with a bend
         assert (y1 - y0) / step_m == pytest.approx(direction_y, abs=1e-3)
+
+
+@pytest.mark.parametrize("margin_m", [0.0, 0.8])
+@pytest.mark.parametrize("lane", [LOWER, UPPER])
+def test_vehicles_short_of_the_swept_area_never_touch_the_ego(lane: int, margin_m: float) -> None:
+    """Drive the whole path past a vehicle that stands just short of the area, and past one that stands just in it."""
+    fronts_m = np.arange(0.0, 50.0, 0.02)
+    poses = np.zeros(len(fronts_m), POSE)
+    place(fronts_m, PATH, poses)
+    start_m = swept_area_start_m(Street(), SHAPE, margin_m)[lane]
+
+    def nearest_m(front_m: float) -> float:
+        x_m = np.full((len(poses), 1), centre_x_m(front_m, lane, Street.half_length_m, SHAPE.length_m))
+        y_m = np.full_like(x_m, (Street.lower_y_m, Street.upper_y_m)[lane])
+        distance_m = np.zeros_like(x_m)
+        present = np.ones(x_m.shape, bool)
+        measure_distances_m(poses, present, x_m, y_m, 5.0, SHAPE.length_m, SHAPE.width_m, distance_m)
+        return float(distance_m.min())
+
+    assert margin_m < nearest_m(start_m - 0.03) < margin_m + 0.03
+    assert nearest_m(start_m + 0.03) <= max(margin_m - 0.01, 0.0)
+
+
+def test_the_swept_area_follows_the_geometry() -> None:
+    wide = Street(turn_radius_m=9.0, upper_y_m=9.0)
+    narrow_m, wide_m = (swept_area_start_m(street, SHAPE, 0.0)[UPPER] for street in (Street(), wide))
+    assert wide_m > narrow_m + 0.5  # the ego reaches the upper lane further east

@@ -1,4 +1,7 @@
 import gc
+import os
+import subprocess
+import sys
 
 import pytest
 
@@ -41,3 +44,17 @@ def test_unknown_backend() -> None:
 def test_traci_says_nothing_on_stdout(capfd: pytest.CaptureFixture[str]) -> None:
     Intersections(1, backend="traci").close()
     assert capfd.readouterr().out == ""
+
+
+def test_a_second_simulation_where_libsumo_stands_in_for_traci() -> None:
+    """Users of other SUMO learning environments have this variable set; ``import traci`` then gives libsumo."""
+    code = (
+        "from tint_sumo.simulation.intersections import Intersections\n"
+        "first, second = Intersections(1), Intersections(1)\n"
+        "first.reset(0, 0), second.reset(0, 0), first.step(), second.step()\n"
+        "assert (first.front_m == second.front_m).all() and first.present.any()\n"
+        "print(first.backend, second.backend)\n"
+    )
+    environment = os.environ | {"LIBSUMO_AS_TRACI": "1"}
+    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert found.stdout.splitlines()[-1] == "libsumo traci"

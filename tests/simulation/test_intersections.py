@@ -376,7 +376,29 @@ def test_a_scene_holds_at_most_twelve_vehicles() -> None:
         simulation.reset_to(0, [PlacedVehicle(0, 5.0, 0)] * 13)
 
 
+def test_a_range_gives_each_episode_a_mix_of_its_own() -> None:
+    replicas = 60
+    simulation = Intersections(replicas, Scenario(traffic=Traffic(p_conservative=(0.1, 0.9))), with_ego=False)
+    try:
+        for replica in range(replicas):
+            simulation.reset(replica, replica)
+        shares = [simulation.yields[row][simulation.present[row]].mean() for row in range(replicas)]
+        # With one mix for all, shares of 10 drivers would vary by no more than sqrt(0.25 / 10) = 0.16.
+        assert np.mean(shares) == pytest.approx(0.5, abs=0.1)
+        assert np.std(shares) > 0.22
+    finally:
+        simulation.close()
+
+
+def test_a_range_of_one_number_is_that_number(batch: Intersections) -> None:
+    single = Intersections(1, Scenario(traffic=Traffic(p_conservative=(0.4, 0.4))), backend="traci")
+    try:
+        assert_same(history(single, 0, seed=3), history(batch, 1, seed=3))
+    finally:
+        single.close()
+
+
 @pytest.mark.parametrize("p", [-0.1, 1.1, float("nan")])
 def test_probabilities_outside_the_unit_interval_are_refused(p: float) -> None:
-    with pytest.raises(InputError, match=r"must lie in \[0, 1\]"):
+    with pytest.raises(InputError, match=r"must be a probability in \[0, 1\]"):
         Traffic(p_conservative=p)

@@ -1,10 +1,12 @@
 """Who reacts to the ego, from when on, and who hits it."""
 
+import numpy as np
 import pytest
 
-from tests.simulation.scenes import CREEP, GO, STEM_M, STOP, scene, speeds, stand_at, until
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
+from tests.simulation.scenes import CREEP, GO, STEM_M, STEP_S, STOP, scene, speeds, stand_at, until
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Scenario, Traffic
 from tint_sumo.scenario.geometry import LOWER, UPPER
+from tint_sumo.simulation.intersections import Intersections
 
 
 def test_conservative_lower_lane_driver_stops_for_a_claiming_ego() -> None:
@@ -68,6 +70,52 @@ def test_drivers_go_on_when_the_ego_gives_up_its_claim() -> None:
         assert simulation.ego_pose["front_y_m"][0] < 1.0
         assert speeds(simulation, STOP)[-1] == pytest.approx(2.4, abs=0.01)
         assert simulation.collision[0] is None
+
+
+def test_only_drivers_that_can_stop_clear_of_the_egos_way_yield() -> None:
+    answers = []
+    for x_m in np.arange(3.0, 12.0, 0.5):
+        with scene((LOWER, CONSERVATIVE, x_m)) as simulation:
+            before_m = 0.0
+            while not simulation.has_claimed[0, LOWER]:
+                before_m = simulation.front_m[0, 0]
+                simulation.step(np.array([GO]))
+            can_stop = simulation._stop_line_m[LOWER] - before_m >= simulation.scenario.claim.stopping_distance_m(2.4)
+            assert simulation.yielding[0, 0] == can_stop
+            answers.append(can_stop)
+            slowest_mps = min(speeds(simulation, GO))
+            assert slowest_mps < 2.3 if can_stop else slowest_mps == pytest.approx(2.4, abs=0.01)
+            assert (simulation.collision[0] is None) or not can_stop
+    assert {True, False} == set(answers)
+
+
+@pytest.mark.parametrize("p_conservative", [0.25, 0.4, 0.6, 1.0])
+@pytest.mark.parametrize("hesitates", [False, True])
+def test_ego_and_driver_never_wait_for_each_other(p_conservative: float, hesitates: bool) -> None:
+    """Nobody but standing drivers holds an ego that wants to drive for more than 3 s, at any time in any episode."""
+    replicas, rng = 48, np.random.default_rng(7)
+    simulation = Intersections(replicas, Scenario(traffic=Traffic(p_conservative=p_conservative)))
+    try:
+        for replica in range(replicas):
+            simulation.reset(replica, replica)
+        waited_steps, desired_mps, ended = np.zeros(replicas, int), np.full(replicas, GO), 0
+        for step in range(800):
+            if hesitates and step % 10 == 0:
+                desired_mps = rng.choice([GO, GO, CREEP, STOP], replicas)
+            before_m = simulation.x_m.copy()
+            simulation.step(desired_mps)
+            near = simulation.present & (simulation._distance_m < simulation.scenario.ego.closing_distance_m)
+            stands = simulation.present & (np.abs(simulation.x_m - before_m) < 1e-3)
+            held = (near & stands & simulation.yields).any(axis=1) & ~(near & ~stands).any(axis=1)
+            waits = held & (desired_mps == GO) & (simulation.ego_speed_mps < 1e-2)
+            waited_steps = np.where(waits, waited_steps + 1, 0)
+            assert waited_steps.max() <= 3.0 / STEP_S
+            for replica in np.flatnonzero(simulation.collided | (simulation.ego_pose["x_m"] > 8.0)).tolist():
+                ended += 1
+                simulation.reset(replica, replicas + ended)
+        assert ended > 2 * replicas  # the street is full of encounters
+    finally:
+        simulation.close()
 
 
 def test_a_collision_is_latched() -> None:

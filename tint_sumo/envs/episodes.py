@@ -16,7 +16,10 @@ from tint_sumo.config import (
     Backend,
     EgoController,
     EpisodeRules,
+    Idm,
+    Population,
     Scenario,
+    Share,
     Traffic,
 )
 from tint_sumo.envs.rows import BOUND, ROW, Rows, Scales, TaskRules, judge, observe
@@ -32,10 +35,11 @@ _ACTIONS_MPS = EgoController().desired_speeds_mps
 class TaskSettings:
     """The arguments of the environments' constructors."""
 
-    p_conservative: float = 0.4
+    p_conservative: Share = 0.4
     reward: str = "paper"
     time_limit_s: float = 50.0
     position_noise_m: float = 0.0
+    tau_s: float = Idm.tau_s
     backend: Backend = "auto"
 
     def __post_init__(self) -> None:
@@ -46,10 +50,14 @@ class TaskSettings:
         if not 0.0 <= self.position_noise_m < math.inf:
             raise InputError(f"position_noise_m must be finite and not negative, not {self.position_noise_m}")
 
+        if not EpisodeRules().step_s <= self.tau_s < math.inf:
+            raise InputError(f"tau_s must be at least a step of 0.1 s, and finite, not {self.tau_s}")
+
     @property
     def scenario(self) -> Scenario:
         rules = replace(EpisodeRules(), time_limit_s=self.time_limit_s)
-        return Scenario(traffic=Traffic(p_conservative=self.p_conservative), episode=rules)
+        population = replace(Population(), idm=replace(Idm(), tau_s=self.tau_s))
+        return Scenario(Traffic(p_conservative=self.p_conservative), population, episode=rules)
 
 
 def action_space() -> spaces.Discrete:

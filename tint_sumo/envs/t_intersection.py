@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.config import Backend
+from tint_sumo.config import Backend, Idm, Share
 from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_actions
 from tint_sumo.envs.rendering import RENDER_FPS, render_intersection, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, OUTCOMES, REWARD_TERMS, ROW, Observation
@@ -18,8 +18,8 @@ class TIntersectionEnv(gymnasium.Env[Any, Any]):
     ## Description
     An uncontrolled T-intersection with left-hand traffic (Liu et al., ICRA 2022), simulated by Eclipse SUMO. The ego
     comes up the stem, crosses the lower lane (westbound) and merges into the upper lane (eastbound). Conservative
-    drivers yield to an ego that moves into their lane; aggressive drivers do not and hit it. The ego's path is fixed;
-    the agent chooses its desired speed, which a PD controller follows and a safety check can override.
+    drivers yield to an ego that moves into their lane while they can still stop clear of its way; aggressive drivers do
+    not and hit it. The ego's path is fixed; the agent chooses its desired speed, which a PD controller follows and a safety check can override.
 
     ## Action Space
     `Discrete(3)`: desired speed 0, 0.5 or 3 m/s.
@@ -64,15 +64,20 @@ class TIntersectionEnv(gymnasium.Env[Any, Any]):
     | `collision`    | after a collision: the other driver's `trait`, `lane`, `slot`, and `ego_m`     |
 
     ## Arguments
-    * `p_conservative`: probability that a driver is conservative, in [0, 1]; default 0.4.
+    * `p_conservative`: probability that a driver is conservative, in [0, 1]; default 0.4. Two numbers are a range, from
+      which each episode draws its probability uniformly, by its seed.
     * `reward`: `"paper"` (default) or `"authors"` (the values of the authors' code).
     * `time_limit_s`: default 50 s.
     * `position_noise_m`: standard deviation of the noise on the others' x and y, independent per vehicle and step.
+    * `tau_s`: time headway of the others' car following (SUMO's `tau`); default 1 s.
     * `backend`: `"libsumo"`, `"traci"` (a sumo subprocess), or `"auto"` (default): libsumo if no other environment of
       this process uses it, since libsumo holds one simulation per process.
     * `render_mode`: `None` or `"rgb_array"`.
 
     ## Version History
+    * v1: a conservative driver that can no longer stop clear of the ego's way drives on. Before, it braked and stood so
+      close that the ego's safety check held the ego: both waited until the time limit, in up to 28 % of the episodes.
+      `p_conservative` takes a range; new argument `tau_s`.
     * v0: first release.
     """
 
@@ -80,17 +85,18 @@ class TIntersectionEnv(gymnasium.Env[Any, Any]):
 
     def __init__(
         self,
-        p_conservative: float = 0.4,
+        p_conservative: Share = 0.4,
         reward: str = "paper",
         time_limit_s: float = 50.0,
         position_noise_m: float = 0.0,
+        tau_s: float = Idm.tau_s,
         backend: Backend = "auto",
         render_mode: str | None = None,
     ) -> None:
         require_render_mode(render_mode)
         self.render_mode = render_mode
         self.observation_space = observation_space()
-        self._episodes = Episodes(1, TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, backend))
+        self._episodes = Episodes(1, TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, tau_s, backend))
         self.action_space = action_space()
 
     def reset(

@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from tint_sumo.config import Backend
+from tint_sumo.config import Backend, Idm, Share
 from tint_sumo.envs.batch import Batch, Ended, LocalBatch
 from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space, require_actions
 from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
@@ -40,10 +40,11 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
     def __init__(
         self,
         num_envs: int = 1,
-        p_conservative: float = 0.4,
+        p_conservative: Share = 0.4,
         reward: str = "paper",
         time_limit_s: float = 50.0,
         position_noise_m: float = 0.0,
+        tau_s: float = Idm.tau_s,
         backend: Backend = "auto",
         render_mode: str | None = None,
         workers: int = 1,
@@ -53,7 +54,7 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         if not 1 <= workers <= num_envs:
             raise InputError(f"workers must be 1 to num_envs = {num_envs}, not {workers}")
         require_render_mode(render_mode)
-        settings = TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, backend)
+        settings = TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, tau_s, backend)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.single_observation_space = observation_space()

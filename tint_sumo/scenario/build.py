@@ -42,7 +42,7 @@ def scenario_files(
         "tint.edg.xml": sources.edges,
         "tint.con.xml": sources.connections,
         NET_FILE: build_network(sources),
-        DRIVERS_FILE: vtypes_xml(scenario.population, scenario.traffic.p_conservative, scenario.vehicle),
+        DRIVERS_FILE: vtypes_xml(scenario.population, scenario.traffic.mean_p_conservative, scenario.vehicle),
         ROUTES_FILE: _routes_xml(replicas),
         "saturated.rou.xml": _flows_xml(replicas, f"exp({_SATURATED_RATE_PER_S:g})"),
         "poisson.rou.xml": _flows_xml(replicas, f"exp({DEMO_POISSON_RATE_PER_S:g})"),

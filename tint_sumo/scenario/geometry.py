@@ -8,6 +8,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from tint_sumo.compiling import compiled
@@ -166,6 +167,33 @@ def place(front_m: Floats, path: EgoPath, poses: Poses) -> None:
         pose.x_m = front_x - path.vehicle_length_m / 2 * pose.heading_x
         pose.y_m = front_y - path.vehicle_length_m / 2 * pose.heading_y
         pose.front_x_m, pose.front_y_m = front_x, front_y
+
+
+_SWEEP_SPACING_M = 0.05  # between the poses of the ego whose boxes make up its swept area
+
+
+def swept_area_start_m(street: Street, vehicle: VehicleShape, margin_m: float) -> Floats:
+    """Distance along each lane at which a vehicle's front comes closer than a margin to the ego's way; (2,).
+
+    A vehicle that stands short of it is never closer than ``margin_m`` to the box of an ego that drives by.
+    """
+    path = EgoPath.of(street, vehicle)
+    fronts_m = np.arange(0.0, path.turn_end_m + vehicle.length_m, _SWEEP_SPACING_M)
+    poses = np.zeros(len(fronts_m), POSE)
+    place(fronts_m, path, poses)
+    ahead = np.stack([poses["heading_x"], poses["heading_y"]], axis=-1) * (vehicle.length_m / 2)
+    abreast = np.stack([-poses["heading_y"], poses["heading_x"]], axis=-1) * (vehicle.width_m / 2)
+    centre = np.stack([poses["x_m"], poses["y_m"]], axis=-1)
+    corners = [centre + ahead + abreast, centre + ahead - abreast, centre - ahead - abreast, centre - ahead + abreast]
+    swept = shapely.buffer(shapely.union_all(shapely.polygons(np.stack(corners, axis=1))), margin_m)
+    starts_m = []
+    for y_m, direction in zip(lane_y_m(street), LANE_DIRECTION, strict=True):
+        half_width_m = vehicle.width_m / 2
+        driven_over = shapely.box(-street.half_length_m, y_m - half_width_m, street.half_length_m, y_m + half_width_m)
+        west_m, _, east_m, _ = shapely.bounds(shapely.intersection(swept, driven_over))
+        first_x_m = west_m if direction > 0.0 else east_m
+        starts_m.append(street.half_length_m + vehicle.length_m / 2 + direction * first_x_m)
+    return np.array(starts_m)
 
 
 @compiled

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import libsumo
-import traci
 from sumolib.miscutils import getFreeSocketPort
+from traci import main as traci  # with LIBSUMO_AS_TRACI the package itself is libsumo under another name
 
 from tint_sumo.config import Backend
 from tint_sumo.errors import InputError

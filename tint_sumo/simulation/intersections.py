@@ -33,6 +33,7 @@ from tint_sumo.scenario.geometry import (
     measure_distances_m,
     place,
     stage_start_m,
+    swept_area_start_m,
 )
 from tint_sumo.scenario.network import EGO_ROUTE, lane_id, name
 from tint_sumo.simulation.connection import Connection, connect
@@ -41,6 +42,7 @@ from tint_sumo.simulation.traffic import DriverPool, DriverStream, admit
 
 _EMPTY = -1
 _STEP_MARGIN_M = 1.0  # more than a vehicle and the ego come closer in a step
+_STOP_MARGIN_M = 0.05  # more than the ego's modelled path may differ from SUMO's
 _EGO_PREFIX = "ego"
 _SPEED_MODE_OBEY_SETSPEED = 32  # all of SUMO's own checks off: the ego drives exactly the speed it is given
 _IGNORE_ON_JUNCTION = "junctionModel.ignoreTypes"
@@ -120,6 +122,7 @@ class Intersections:
     ``ego_pose``       (R,)     records of :data:`~tint_sumo.scenario.geometry.POSE`
     ``time_s``         (R,)     since the episode's start
     ``has_claimed``    (R, 2)   which lanes (lower, upper) the ego claims
+    ``yielding``       (R, 12)  which drivers react to the ego's claim on their lane
     ``collision``      R items  the ego's first collision in the episode, or None
     ================== ======== ==================================================================
 
@@ -146,6 +149,9 @@ class Intersections:
         self._yields = np.array([*(member.profile.yields for member in self.population), False])  # the last: empty
         self._lane_y_m = lane_y_m(scenario.street)
         self._stage_start_m = stage_start_m(scenario.street, scenario.vehicle)
+        self._stop_line_m = swept_area_start_m(
+            scenario.street, scenario.vehicle, scenario.ego.unsafe_distance_m + _STOP_MARGIN_M
+        )
         self._lengths_m = (scenario.street.half_length_m, scenario.vehicle.length_m)
 
         # Of the safety check, which needs to know how far away a vehicle was a step before.
@@ -164,6 +170,7 @@ class Intersections:
         self.ego_pose: Poses = np.zeros(replicas, POSE)
         self.time_s: Floats = np.zeros(replicas)
         self.has_claimed: Bools = np.zeros((replicas, 2), bool)
+        self.yielding: Bools = np.zeros(slots, bool)
         self.collision: list[Collision | None] = [None] * replicas
         self._index: dict[str, int] = {}  # of each vehicle's slot: replica * 12 + slot; so numbered are also these:
         self._stage = np.zeros(replicas * MAX_VEHICLES, np.int64)  # which of its lane's three SUMO lanes it is on
@@ -210,7 +217,10 @@ class Intersections:
     def reset(self, replica: int, seed: int | Sequence[int] | np.random.SeedSequence) -> None:
         """Empty a replica and start a new random episode in it."""
         sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
-        streams = tuple(DriverStream(np.random.default_rng(child), self._pool) for child in sequence.spawn(2))
+        p_conservative = np.random.default_rng(sequence).uniform(*self.scenario.traffic.p_conservative_range)
+        streams = tuple(
+            DriverStream(np.random.default_rng(child), self._pool, p_conservative) for child in sequence.spawn(2)
+        )
         placed = [
             PlacedVehicle(lane, front_m, driver.member)
             for lane, stream in enumerate(streams)
@@ -289,8 +299,6 @@ class Intersections:
         if not member.profile.yields:
             vehicle.setParameter(vehicle_id, _IGNORE_AS_LEADER, EGO_TYPE)
         vehicle.setParameter(vehicle_id, _IGNORE_ON_JUNCTION, EGO_TYPE)
-        if member.profile.yields and self.has_claimed[replica, lane]:
-            self._set_yielding(vehicle_id, placed.member, True)
         self._ids[replica][slot] = vehicle_id
         index = replica * MAX_VEHICLES + slot
         self._index[vehicle_id] = index
@@ -304,12 +312,15 @@ class Intersections:
         self.x_m[replica, slot] = centre_x_m(placed.front_m, lane, *self._lengths_m)
         self.y_m[replica, slot] = self._lane_y_m[lane]
         self._last_slot[replica, lane] = index
+        if self.has_claimed[replica, lane]:
+            self._answer_claim(replica, slot, member.desired_speed_mps)
 
     def _forget(self, vehicle_id: str) -> None:
         index = self._index.pop(vehicle_id)
         replica, slot = divmod(index, MAX_VEHICLES)
         self._ids[replica][slot] = ""
         self.present[replica, slot] = False
+        self.yielding[replica, slot] = False
         self.member[replica, slot] = _EMPTY
         self.vehicle_number[replica, slot] = _EMPTY
         lane = self.lane[replica, slot]
@@ -376,16 +387,29 @@ class Intersections:
         changed = self._claim_changed
         if not update_claims(self.ego_pose, self.ego_speed_mps, self._ego_rules, self.has_claimed, changed):
             return
+        get_speed = self._connection.vehicle.getSpeed
         for replica, lane in _where(changed):
-            claimed = bool(self.has_claimed[replica, lane])
-            for slot in np.flatnonzero(self.yields[replica] & (self.lane[replica] == lane)):
-                self._set_yielding(self._ids[replica][slot], self.member[replica, slot], claimed)
+            on_lane = self.present[replica] & (self.lane[replica] == lane)
+            if self.has_claimed[replica, lane]:
+                for slot in np.flatnonzero(on_lane).tolist():
+                    self._answer_claim(replica, slot, get_speed(self._ids[replica][slot]))
+            else:
+                for slot in np.flatnonzero(on_lane & self.yielding[replica]).tolist():
+                    self._set_yielding(replica, slot, False)
 
-    def _set_yielding(self, vehicle_id: str, member: int, yielding: bool) -> None:
-        vehicle = self._connection.vehicle
+    def _answer_claim(self, replica: int, slot: int, speed_mps: float) -> None:
+        """Let a driver on a claimed lane yield, if that is its trait and it can still stop clear of the ego's way."""
+        room_m = self._stop_line_m[self.lane[replica, slot]] - self.front_m[replica, slot]
+        can_stop = room_m >= self.scenario.claim.stopping_distance_m(speed_mps)
+        if self._yields[self.member[replica, slot]] and can_stop:
+            self._set_yielding(replica, slot, True)
+
+    def _set_yielding(self, replica: int, slot: int, yielding: bool) -> None:
+        self.yielding[replica, slot] = yielding
+        vehicle, vehicle_id = self._connection.vehicle, self._ids[replica][slot]
         vehicle.setParameter(vehicle_id, _IGNORE_ON_JUNCTION, "" if yielding else EGO_TYPE)
         courtesy_m = self.scenario.claim.courtesy_gap_m if yielding else 0.0
-        vehicle.setMinGap(vehicle_id, self.population[member].min_gap_m + courtesy_m)
+        vehicle.setMinGap(vehicle_id, self.population[self.member[replica, slot]].min_gap_m + courtesy_m)
 
     def _read_positions(self) -> None:
         count = len(self._index)

@@ -37,16 +37,21 @@ class DriverPool:
 
 
 class DriverStream:
-    """The endless sequence of drivers on one lane; its k-th driver depends on the lane's seed alone."""
+    """The endless sequence of drivers on one lane; its k-th driver depends on the lane's seed and the mix alone.
 
-    def __init__(self, rng: np.random.Generator, pool: DriverPool) -> None:
+    Args:
+        p_conservative: probability that a driver of this episode is conservative.
+    """
+
+    def __init__(self, rng: np.random.Generator, pool: DriverPool, p_conservative: float) -> None:
         self._rng = rng
         self._pool = pool
+        self._p_conservative = p_conservative
         self.upcoming = self._draw()
 
     def _draw(self) -> Driver:
         rng, pool, traffic = self._rng, self._pool, self._pool.scenario.traffic
-        candidates = pool.by_trait[bool(rng.random() < traffic.p_conservative)]
+        candidates = pool.by_trait[bool(rng.random() < self._p_conservative)]
         member = candidates[int(rng.integers(len(candidates)))]
         low_m, high_m = pool.population[member].profile.entry_gap_m
         gap_m = low_m + (high_m - low_m) * rng.random()

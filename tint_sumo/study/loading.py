@@ -8,7 +8,7 @@ from typing import Any
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits
-from tint_sumo.config import LATENT_SIZE
+from tint_sumo.config import LATENT_SIZE, Share, ends, is_share
 from tint_sumo.envs.sb3 import TIntersectionVecEnv
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, shipped
@@ -28,10 +28,10 @@ class Contender:
     name: str
     policy: Policy
     source: Callable[[], TraitSource] | None = None  # where the traits in its observations come from; None: no traits
-    p_conservative: float = DEFAULT_P_CONSERVATIVE  # what it was trained for
+    p_conservative: Share = DEFAULT_P_CONSERVATIVE  # what it was trained for
     action_repeat: int = 1  # simulation steps per decision
 
-    def make_venv(self, num_envs: int, p_conservative: float) -> VecEnv:
+    def make_venv(self, num_envs: int, p_conservative: Share) -> VecEnv:
         """Environments with the observations the policy takes."""
         venv: VecEnv = TIntersectionVecEnv(num_envs, p_conservative=p_conservative)
         observed = venv if self.source is None else TraitObservation(venv, self.source())
@@ -60,7 +60,7 @@ def load_policy(name_or_path: str | Path) -> Contender:
         str(name_or_path),
         policy,
         lambda: learned.source(encoder),
-        float(card["p_conservative"]),
+        ends(card["p_conservative"]),
         int(card["settings"]["action_repeat"]),
     )
 
@@ -84,7 +84,7 @@ def _read_card(file: Path) -> dict[str, Any]:
     card_file = file.with_suffix(".json")
     card = read_json(card_file, "card of the policy")
     method = METHODS.get(str(card.get("method")))
-    known = isinstance(method, Learned) and isinstance(card.get("p_conservative"), int | float)
+    known = isinstance(method, Learned) and is_share(card.get("p_conservative"))
     has_traits = isinstance(card.get("traits"), str)
     settings = card.get("settings")
     known &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)

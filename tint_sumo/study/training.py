@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from tint_sumo import traits as trait_models
-from tint_sumo.config import LATENT_SIZE, PpoSettings, Traffic
+from tint_sumo.config import LATENT_SIZE, PpoSettings, Share, ends, require_share
 from tint_sumo.envs.sb3 import TIntersectionVecEnv
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file, write_json
@@ -39,7 +39,7 @@ RECENT_EPISODES = 200
 
 def train_policy(
     method: str,
-    p_conservative: float,
+    p_conservative: Share,
     steps: int,
     seed: int,
     out: Path,
@@ -54,7 +54,7 @@ def train_policy(
 
     Args:
         method: name of a learned method.
-        p_conservative: share of conservative drivers it trains among.
+        p_conservative: share of conservative drivers it trains among; a range: each episode draws its own.
         steps: decisions of the policy, at least; training ends with a whole rollout.
         seed: of weights, actions and environments, 0 to 1000.
         out: a new folder, or the one of this very run. A TensorBoard log goes to ``out/tensorboard``.
@@ -69,7 +69,7 @@ def train_policy(
         InputError: bad values, no such method or trait model, ``out`` holds another run, or its checkpoint is damaged.
     """
     learned = find_learned(method)
-    Traffic(p_conservative)
+    require_share(p_conservative)
     require_seed(seed)
     if steps < 1:
         raise InputError(f"steps must be at least 1, not {steps}")
@@ -77,7 +77,7 @@ def train_policy(
     identity = {
         "kind": "policy",
         "method": method,
-        "p_conservative": p_conservative,
+        "p_conservative": list(ends(p_conservative)),
         "steps": steps,
         "seed": seed,
         "settings": asdict(settings),

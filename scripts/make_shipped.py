@@ -26,7 +26,7 @@ from tint_sumo.traits.storage import add_to_card
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 QUICK = BUDGETS["quick"].ppo
-SHIPPED_TRAITS = {"ours": 0.0, "ours_plus": 0.05, "morton": 0.0, "classifier": 0.0}  # and the noise in training, m
+SHIPPED_TRAITS = {"vae": 0.0, "cross_window": 0.05, "morton": 0.0, "classifier": 0.0}  # and the noise in training, m
 POLICY_STEPS = 1_200_000
 POLICY_SETTINGS = replace(QUICK, n_epochs=4, n_minibatches=4, learning_rate=1e-3, ent_coef=0.005, time_limit_s=50.0)
 
@@ -54,14 +54,14 @@ def make_traits(work: Path) -> None:
         add_to_card(model, {"accuracy_by_noise": accuracy})  # in m; the linear classifier is fitted to each noise
         run("traits", "plot", "--data", dataset, "--model", str(model), "--noise", f"{noise_m}", "--out", str(work))
         copy(work / "latent.png", DATA / "images" / f"latent_{method}.png")
-    run("traits", "plot", "--data", dataset, "--model", "ours", "--out", str(work))
+    run("traits", "plot", "--data", dataset, "--model", "vae", "--out", str(work))
     copy(work / "reconstruction.png", DATA / "images" / "reconstruction.png")
 
 
 def make_policy(work: Path) -> None:
-    policy = work / "ours04"
-    with progress_bar("policy ours", "step") as report:
-        train_policy("ours", 0.4, POLICY_STEPS, 0, policy, settings=POLICY_SETTINGS, traits="ours", report=report)
+    policy = work / "vae04"
+    with progress_bar("policy vae", "step") as report:
+        train_policy("vae", 0.4, POLICY_STEPS, 0, policy, settings=POLICY_SETTINGS, traits="vae", report=report)
     for name in ("policy.zip", "policy.json", "traits.safetensors", "traits.json"):
         copy(policy / name, DATA / "models" / name)
 

@@ -54,8 +54,8 @@ def trait_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     settings = TraitSettings(embedding_sizes=(8, 8), hidden_size=8, encoder_output_size=8, decoder_output_size=8)
     folder = tmp_path_factory.mktemp("model")
-    save(traits.METHODS["ours"](settings), folder / "model", {"seed": 0})
-    save(traits.METHODS["ours"](settings, latent_size=3), folder / "wide", {"seed": 0})
+    save(traits.METHODS["vae"](settings), folder / "model", {"seed": 0})
+    save(traits.METHODS["vae"](settings, latent_size=3), folder / "wide", {"seed": 0})
     return folder / "model.safetensors"
 
 
@@ -194,10 +194,10 @@ def test_dataset_inspect(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_policy_train(tmp_path: Path, trait_model: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
-    argv = ("policy", "train", "--method", "ours", "--steps", 1, "--traits", trait_model, "--out", out)
+    argv = ("policy", "train", "--method", "vae", "--steps", 1, "--traits", trait_model, "--out", out)
     printed = run(capsys, *argv, "--p-conservative", 0.25)
     assert printed == {
-        "model": str(out / "policy.zip"), "method": "ours", "p_conservative": 0.25, "steps": 1, "seed": 0
+        "model": str(out / "policy.zip"), "method": "vae", "p_conservative": 0.25, "steps": 1, "seed": 0
     }  # fmt: skip
     before = files(out)
     assert "another run" in refuse(capsys, *argv, "--p-conservative", 0.3)
@@ -251,8 +251,8 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ("policy train --method ttc --out OUT", "hand-written rule"),
         ("policy train --method oracle --p-conservative -0.1 --out OUT", "p_conservative"),
         ("policy train --method oracle --steps 0 --out OUT", "steps"),
-        ("policy train --method ours --traits nobody --out OUT", "no trait model nobody"),
-        ("policy train --method ours --traits WIDE --out OUT", "3 latents where 2 are needed"),
+        ("policy train --method vae --traits nobody --out OUT", "no trait model nobody"),
+        ("policy train --method vae --traits WIDE --out OUT", "3 latents where 2 are needed"),
         ("policy evaluate --model nobody", "no policy nobody"),
         ("policy evaluate --model ttc --p-conservative 2", "p_conservative"),
         ("policy evaluate --model ttc --episodes 0", "episodes"),

@@ -46,7 +46,7 @@ import tint_sumo.files, tint_sumo.traits
 assert tint_sumo.__file__.startswith({str(tmp_path)!r}), tint_sumo.__file__
 assert str(tint_sumo.files.shipped("models")).startswith({str(tmp_path)!r})
 assert (tint_sumo.files.shipped("sumo_net") / "tint.net.xml").exists()
-print(tint_sumo.traits.load("ours").latent_size)
+print(tint_sumo.traits.load("vae").latent_size)
 """
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr

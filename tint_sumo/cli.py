@@ -127,8 +127,8 @@ class TrainTraits(Command):
     """Folder of a dataset."""
     out: Path
     """Folder for the model."""
-    method: str = "ours"
-    """ours (the paper's), ours_plus and morton learn without labels, classifier with them."""
+    method: str = "vae"
+    """vae (the paper's), cross_window and morton learn without labels, classifier with them."""
     budget: TraitBudgetName = "quick"
     """quick: for about 30,000 windows; full: for some 700,000; paper: the paper's network and 1000 epochs."""
     noise: float = 0.0
@@ -257,7 +257,7 @@ class TrainPolicy(Command):
     after_interrupt: ClassVar[str] = RESUMES
 
     method: str
-    """Learned method: no_labels, ours or oracle."""
+    """Learned method: no_labels, vae or oracle."""
     out: Path
     """Folder for the policy, its card and the TensorBoard log."""
     p_conservative: float = 0.4
@@ -268,7 +268,7 @@ class TrainPolicy(Command):
     """Seed of the training, 0 to 1000."""
     budget: BudgetName = "quick"
     """Sizes of the network and settings of PPO."""
-    traits: str = "ours"
+    traits: str = "vae"
     """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file."""
 
     def run(self) -> Outcome:

@@ -21,7 +21,7 @@ def budget() -> Budget:
         windows=100,
         traits=network,
         ppo=PpoSettings(n_envs=4, n_steps=16, n_epochs=1, n_minibatches=1, total_steps=64),
-        methods=("always_go", "ours"),
+        methods=("always_go", "vae"),
         p_conservative=(0.4,),
         seeds=(0,),
         episodes=4,
@@ -43,19 +43,19 @@ def test_a_study_leaves_everything_it_made(finished: Path) -> None:
     made = {str(path.relative_to(finished)) for path in finished.rglob("*")}
     assert made >= {
         "dataset/manifest.json",
-        "traits/ours/model.safetensors",
-        "traits/ours/evaluation.json",
-        "traits/ours/latent.png",
-        "policies/ours-P0.4-seed0/policy.zip",
+        "traits/vae/model.safetensors",
+        "traits/vae/evaluation.json",
+        "traits/vae/latent.png",
+        "policies/vae-P0.4-seed0/policy.zip",
         "results/always_go-P0.4-seed0.json",
-        "results/ours-P0.4-seed0.json",
+        "results/vae-P0.4-seed0.json",
         "results.csv",
         "results.md",
         "results.png",
     }
     assert not [path for path in made if path.endswith(".partial")]
-    accuracy = json.loads((finished / "traits/ours/evaluation.json").read_text())["accuracy"]
-    assert json.loads((finished / "traits/ours/model.json").read_text())["accuracy"] == accuracy
+    accuracy = json.loads((finished / "traits/vae/evaluation.json").read_text())["accuracy"]
+    assert json.loads((finished / "traits/vae/model.json").read_text())["accuracy"] == accuracy
 
 
 def test_only_what_is_missing_is_made_again(budget: Budget, finished: Path) -> None:
@@ -65,7 +65,7 @@ def test_only_what_is_missing_is_made_again(budget: Budget, finished: Path) -> N
     lost.unlink()
     report = run_study(budget, finished, workers=1, progress=False)
     assert lost.read_text() == content
-    assert [row.method for row in report.rows] == ["always_go", "ours"]
+    assert [row.method for row in report.rows] == ["always_go", "vae"]
     changed = {path for path, time in times(finished).items() if before.get(path) != time}
     assert changed == {"results/always_go-P0.4-seed0.json", "results.csv", "results.md", "results.png"}
 
@@ -82,12 +82,12 @@ def test_the_plan_is_the_whole_grid(tmp_path: Path) -> None:
     jobs = plan(budget, tmp_path)
     grid = {(job.method, job.p_conservative, job.seed) for job in jobs if isinstance(job, PolicyJob)}
     assert len(grid) == len(budget.methods) * 3 * 3
-    assert [job.name for job in jobs if isinstance(job, TraitJob)] == ["traits ours"]
+    assert [job.name for job in jobs if isinstance(job, TraitJob)] == ["traits vae"]
     assert len({job.name for job in jobs}) == len(jobs)
     names = {job.name for job in jobs}
     assert all(set(job.needs) <= names for job in jobs)
     encoders = {job.method for job in jobs if isinstance(job, PolicyJob) and job.needs}
-    assert encoders == {"ours"}
+    assert encoders == {"vae"}
 
 
 @pytest.mark.parametrize("name", BUDGETS)

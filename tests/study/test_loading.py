@@ -51,7 +51,7 @@ def change_card(policy: Path, **changes: Any) -> None:
     card_file.write_text(json.dumps({**json.loads(card_file.read_text()), **changes}))
 
 
-@pytest.mark.parametrize("changes", [{"method": "ttc"}, {"method": "ours"}, {"p_conservative": None}, {"settings": {}}])
+@pytest.mark.parametrize("changes", [{"method": "ttc"}, {"method": "vae"}, {"p_conservative": None}, {"settings": {}}])
 def test_a_wrong_card(trained: Path, changes: dict[str, Any]) -> None:
     change_card(trained, **changes)
     with pytest.raises(InputError, match=r"policy\.json is not the card of a policy"):
@@ -65,6 +65,6 @@ def test_a_damaged_card(trained: Path) -> None:
 
 
 def test_a_missing_trait_model(trained: Path) -> None:
-    change_card(trained, method="ours", traits="traits")
+    change_card(trained, method="vae", traits="traits")
     with pytest.raises(InputError, match="no trait model"):
         load_policy(trained)

@@ -19,7 +19,7 @@ class Constant:
 
 
 def test_the_methods_of_the_study() -> None:
-    assert list(METHODS) == ["always_go", "ttc", "no_labels", "ours", "oracle"]
+    assert list(METHODS) == ["always_go", "ttc", "no_labels", "vae", "oracle"]
     assert {name for name, method in METHODS.items() if isinstance(method, Rule)} == {"always_go", "ttc"}
 
 
@@ -29,7 +29,7 @@ def test_trait_sources() -> None:
         for name, method in METHODS.items()
         if isinstance(method, Learned)
     }
-    assert sources == {"no_labels": NoTraits, "ours": EncoderTraits, "oracle": OracleTraits}
+    assert sources == {"no_labels": NoTraits, "vae": EncoderTraits, "oracle": OracleTraits}
 
 
 def test_rules_act() -> None:
@@ -47,11 +47,11 @@ def test_a_name_is_taken_once() -> None:
 
 
 def test_unknown_methods_are_refused_with_the_known_ones() -> None:
-    with pytest.raises(InputError, match="unknown method 'magic'; choose one of: always_go, ttc, no_labels, ours"):
+    with pytest.raises(InputError, match="unknown method 'magic'; choose one of: always_go, ttc, no_labels, vae"):
         find_method("magic")
 
 
 def test_rules_are_not_trained() -> None:
-    with pytest.raises(InputError, match=r"hand-written rule.*choose one of: no_labels, ours, oracle"):
+    with pytest.raises(InputError, match=r"hand-written rule.*choose one of: no_labels, vae, oracle"):
         find_learned("ttc")
-    assert find_learned("ours").encoder == "ours"
+    assert find_learned("vae").encoder == "vae"

@@ -23,7 +23,7 @@ SMALL_VAE = TraitSettings(embedding_sizes=(4, 4), hidden_size=4, encoder_output_
 def trait_model(tmp_path: Path) -> Path:
     """A trait model nobody trained."""
     torch.manual_seed(0)
-    save(traits.METHODS["ours"](SMALL_VAE), tmp_path / "some" / "encoder", {"seed": 0})
+    save(traits.METHODS["vae"](SMALL_VAE), tmp_path / "some" / "encoder", {"seed": 0})
     return tmp_path / "some" / "encoder.safetensors"
 
 
@@ -138,7 +138,7 @@ def test_bad_values_leave_no_folder(
 
 
 def test_the_trait_model_travels_with_the_policy(tmp_path: Path, tiny: PpoSettings, trait_model: Path) -> None:
-    policy = train_policy("ours", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
+    policy = train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
     trait_model.unlink()
     moved = (tmp_path / "run").rename(tmp_path / "moved")
     for path in (moved, moved / policy.name):
@@ -151,17 +151,17 @@ def test_the_trait_model_travels_with_the_policy(tmp_path: Path, tiny: PpoSettin
 
 
 def test_another_trait_model_is_another_run(tmp_path: Path, tiny: PpoSettings, trait_model: Path) -> None:
-    train_policy("ours", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
-    other = traits.METHODS["ours"](SMALL_VAE)
+    train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
+    other = traits.METHODS["vae"](SMALL_VAE)
     save(other, trait_model.with_suffix(""), {})
     with pytest.raises(InputError, match=r"another run \(different: traits\)"):
-        train_policy("ours", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
+        train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
 
 
 def test_a_trait_model_of_another_latent_size_is_refused(tmp_path: Path, tiny: PpoSettings) -> None:
-    save(traits.METHODS["ours"](SMALL_VAE, latent_size=3), tmp_path / "wide", {})
+    save(traits.METHODS["vae"](SMALL_VAE, latent_size=3), tmp_path / "wide", {})
     with pytest.raises(InputError, match="3 latents where 2 are needed"):
-        train_policy("ours", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=tmp_path / "wide.safetensors")
+        train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=tmp_path / "wide.safetensors")
     assert not (tmp_path / "run").exists()
 
 

@@ -79,9 +79,9 @@ def test_evaluation_and_pictures_take_the_episodes_left_out_by_the_model_s_seed(
 @pytest.mark.parametrize(
     ("name", "noise_m", "least"),
     [
-        ("ours", 0.0, 0.985),
-        ("ours_plus", 0.0, 0.99),
-        ("ours_plus", 0.05, 0.98),
+        ("vae", 0.0, 0.985),
+        ("cross_window", 0.0, 0.99),
+        ("cross_window", 0.05, 0.98),
         ("morton", 0.0, 0.97),
         ("classifier", 0.0, 0.99),
     ],
@@ -95,11 +95,11 @@ def test_shipped_models_are_small_and_tell_unseen_drivers_apart(
 
 
 def test_noise_makes_evaluation_harder_and_is_repeatable(dataset: Path) -> None:
-    clean, noisy, again = (evaluate_traits(dataset, "ours", noise_m=noise_m) for noise_m in (0.0, 0.3, 0.3))
+    clean, noisy, again = (evaluate_traits(dataset, "vae", noise_m=noise_m) for noise_m in (0.0, 0.3, 0.3))
     assert noisy == again
     assert noisy["accuracy"] < clean["accuracy"] - 0.1
     with pytest.raises(InputError, match="0 or more, not -1"):
-        evaluate_traits(dataset, "ours", noise_m=-1.0)
+        evaluate_traits(dataset, "vae", noise_m=-1.0)
 
 
 @pytest.mark.parametrize("method", sorted(METHODS))

@@ -18,13 +18,13 @@ from tint_sumo.study.trait_study import CompareJob, TraitStudy, run_trait_study
 SMALL = TraitStudy(
     windows=100,
     settings=TraitSettings((), hidden_size=8, encoder_output_size=8, decoder_output_size=8, batch_size=64, epochs=1),
-    methods=("ours_plus", "classifier"),
+    methods=("cross_window", "classifier"),
     noises_m=(0.0, 0.1),
     seeds=(0, 1),
     other_p=(0.25,),
     other_windows=100,
     continuous_windows=100,
-    continuous_methods=("ours_plus",),
+    continuous_methods=("cross_window",),
     continuous_latents=(3,),
     continuous_epochs=1,
 )
@@ -41,7 +41,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_method_is_measured_at_every_noise(finished: Path) -> None:
     table = pd.read_csv(finished / "traits.csv")
     cells = list(zip(table["method"], table["noise_m"], strict=True))
-    assert cells == [(method, noise) for method in ("classifier", "ours_plus") for noise in (0.0, 0.1)]
+    assert cells == [(method, noise) for method in ("classifier", "cross_window") for noise in (0.0, 0.1)]
     assert (table["seeds"] == 2).all()
     measures = ["svc_percent", "knn_percent", "svc_20_percent", "svc_without_leader_percent", "svc_P0.25_percent"]
     assert table[measures].stack().between(0.0, 100.0).all()
@@ -53,15 +53,15 @@ def test_every_method_is_measured_at_every_noise(finished: Path) -> None:
     assert continuous["latent_size"].tolist() == [3, 3]
     assert (continuous[["r2_desired_speed_mps", "r2_min_gap_m"]] <= 1.0).all(axis=None)
     assert (finished / "traits.png").read_bytes().startswith(b"\x89PNG")
-    assert "| ours_plus" in (finished / "traits.md").read_text()
-    card = read_json(finished / "models" / "ours_plus-noise0.1-seed1" / "model.json", "card")
+    assert "| cross_window" in (finished / "traits.md").read_text()
+    card = read_json(finished / "models" / "cross_window-noise0.1-seed1" / "model.json", "card")
     assert card["settings"]["noise_m"] == 0.1
     assert 0.0 <= card["accuracy"] <= 1.0
 
 
 @pytest.mark.slow
 def test_a_finished_part_is_not_repeated_and_a_missing_one_is_made_again(finished: Path) -> None:
-    lost = finished / RESULTS / "ours_plus-noise0.1-seed0.json"
+    lost = finished / RESULTS / "cross_window-noise0.1-seed0.json"
     found = read_json(lost, "result")
     kept = {file: file.stat().st_mtime_ns for file in (finished / RESULTS).iterdir() if file != lost}
     lost.unlink()
@@ -88,16 +88,16 @@ def test_bad_studies_are_refused_before_anything_is_written(tmp_path: Path) -> N
 
 
 def test_a_job_is_done_with_its_last_noise(tmp_path: Path) -> None:
-    job = CompareJob(SMALL, "ours", 0, tmp_path)
+    job = CompareJob(SMALL, "vae", 0, tmp_path)
     (tmp_path / RESULTS).mkdir()
-    (tmp_path / RESULTS / "ours-noise0-seed0.json").write_text("{}")
+    (tmp_path / RESULTS / "vae-noise0-seed0.json").write_text("{}")
     assert not job.is_done()
-    (tmp_path / RESULTS / "ours-noise0.1-seed0.json").write_text("{}")
+    (tmp_path / RESULTS / "vae-noise0.1-seed0.json").write_text("{}")
     assert job.is_done()
 
 
 def test_means_and_spreads_are_over_the_seeds() -> None:
-    row = {"method": "ours", "noise_m": 0.0, "windows": 10, "training_windows": 20, "error_m": None, "training_s": None}
+    row = {"method": "vae", "noise_m": 0.0, "windows": 10, "training_windows": 20, "error_m": None, "training_s": None}
     parts = {f"svc_{part}_percent": 90.0 for part in ("2_to_5", "6_to_10", "11_to_19", "20")}
     parts |= {"svc_with_leader_percent": 90.0, "svc_without_leader_percent": math.nan, "svc_P0.4_percent": 80.0}
     rows = [

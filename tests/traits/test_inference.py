@@ -30,20 +30,20 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def ours_plus(tmp_path_factory: pytest.TempPathFactory, small: TraitSettings) -> Path:
+def cross_window(tmp_path_factory: pytest.TempPathFactory, small: TraitSettings) -> Path:
     """A model nobody trained, of some uncertainty."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        model = METHODS["ours_plus"](small)
+        model = METHODS["cross_window"](small)
     stem = tmp_path_factory.mktemp("model") / "model"
     save(model, stem, {"seed": 0})
     return stem.parent
 
 
 def test_a_dataset_gives_the_latents_of_its_windows(dataset: Path) -> None:
-    table = infer_traits(dataset, "ours")
+    table = infer_traits(dataset, "vae")
     windows = load_windows(dataset)
-    expected = encode_windows(load("ours"), windows)
+    expected = encode_windows(load("vae"), windows)
     np.testing.assert_allclose(table[LATENTS], expected.mean, atol=1e-5)
     np.testing.assert_allclose(table[STDS], expected.std, rtol=1e-4)
     assert list(table) == [*KEYS, *LATENTS, *STDS]
@@ -56,8 +56,8 @@ def test_a_dataset_gives_the_latents_of_its_windows(dataset: Path) -> None:
 
 def test_floating_car_data_give_nearly_the_same(dataset: Path) -> None:
     """Two decimals of the speeds are left of the displacements."""
-    exact = infer_traits(dataset, "ours")
-    rounded = infer_traits(dataset / "fcd" / "shard-00000.xml.gz", "ours", net_file=NET)
+    exact = infer_traits(dataset, "vae")
+    rounded = infer_traits(dataset / "fcd" / "shard-00000.xml.gz", "vae", net_file=NET)
     both = exact.merge(rounded, on=KEYS, suffixes=("", "_fcd"))
     assert len(both) > 0.99 * len(exact) == 0.99 * len(rounded)
     error = np.abs(both[LATENTS].to_numpy() - both[[f"{name}_fcd" for name in LATENTS]].to_numpy())
@@ -66,8 +66,8 @@ def test_floating_car_data_give_nearly_the_same(dataset: Path) -> None:
     assert exact[LATENTS].std().min() > 1.0
 
 
-def test_running_fusion_is_the_fusion_of_the_windows_so_far(dataset: Path, ours_plus: Path) -> None:
-    table = infer_traits(dataset / TRAJECTORIES, ours_plus)
+def test_running_fusion_is_the_fusion_of_the_windows_so_far(dataset: Path, cross_window: Path) -> None:
+    table = infer_traits(dataset / TRAJECTORIES, cross_window)
     assert list(table)[-4:] == ["fused_latent_1", "fused_latent_2", "fused_std_1", "fused_std_2"]
     longest = table["vehicle"].value_counts().index[:3]
     for _, part in table[table["vehicle"].isin(longest)].groupby("vehicle", observed=True):
@@ -82,13 +82,13 @@ def test_running_fusion_is_the_fusion_of_the_windows_so_far(dataset: Path, ours_
             )
 
 
-def test_a_vehicle_that_comes_back_goes_on_counting(tmp_path: Path, ours_plus: Path) -> None:
+def test_a_vehicle_that_comes_back_goes_on_counting(tmp_path: Path, cross_window: Path) -> None:
     steps = "".join(
         f'<timestep time="{time:.1f}"><vehicle id="a" lane="e_0" pos="{time:.2f}" speed="1.00"/></timestep>'
         for time in [*np.arange(0.0, 2.25, 0.1), *np.arange(5.0, 5.65, 0.1), 9.0]
     )
     (tmp_path / "fcd.xml").write_text(f"<fcd-export>{steps}</fcd-export>")
-    table = infer_traits(tmp_path / "fcd.xml", ours_plus)
+    table = infer_traits(tmp_path / "fcd.xml", cross_window)
     assert table[["window", "start_s", "end_s", "steps"]].to_numpy().tolist() == [
         [0.0, 0.0, 1.9, 20.0],
         [1.0, 2.0, 2.2, 3.0],
@@ -103,12 +103,12 @@ def test_no_window_is_no_table(tmp_path: Path) -> None:
     )
     (tmp_path / "fcd.xml").write_text(f"<fcd-export>{steps}</fcd-export>")
     with pytest.raises(InputError, match="2 steps"):
-        infer_traits(tmp_path / "fcd.xml", "ours")
+        infer_traits(tmp_path / "fcd.xml", "vae")
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_tables_come_back_as_they_were(tmp_path: Path, dataset: Path, suffix: str) -> None:
-    table, file = infer_traits(dataset, "ours"), tmp_path / f"table.{suffix}"
+    table, file = infer_traits(dataset, "vae"), tmp_path / f"table.{suffix}"
     write_table(table, file)
     found = pd.read_csv(file, dtype={"vehicle": str}) if suffix == "csv" else pd.read_parquet(file)
     assert found["vehicle"].astype(str).tolist() == table["vehicle"].astype(str).tolist()

@@ -52,13 +52,13 @@ def test_a_constant_feature_is_only_centred(model, states):
 
 def test_two_methods_of_one_name_are_refused():
     class Another(Vae):
-        method = "ours"
+        method = "vae"
 
-    with pytest.raises(ValueError, match="two trait methods are called 'ours'"):
+    with pytest.raises(ValueError, match="two trait methods are called 'vae'"):
         register(Another)
-    assert METHODS["ours"] is Vae
+    assert METHODS["vae"] is Vae
 
 
 def test_an_unknown_method_is_answered_with_the_known_ones():
-    with pytest.raises(InputError, match=r"unknown trait method 'theirs'; choose one of: .*ours"):
+    with pytest.raises(InputError, match=r"unknown trait method 'theirs'; choose one of: .*vae"):
         find_method("theirs")

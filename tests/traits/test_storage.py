@@ -6,6 +6,7 @@ import torch
 
 from tint_sumo.errors import InputError
 from tint_sumo.traits import load, storage
+from tint_sumo.traits.model import find_method
 from tint_sumo.traits.storage import add_to_card, read_card, save
 from tint_sumo.traits.vae import Vae
 
@@ -26,9 +27,9 @@ def saved(model, tmp_path):
 
 @pytest.fixture
 def shelf(model, tmp_path, monkeypatch):
-    """A folder of shipped models: ``ours`` and ``older``, and a file that is none."""
+    """A folder of shipped models: ``vae`` and ``older``, and a file that is none."""
     folder = tmp_path / "models"
-    for name in ("ours", "older"):
+    for name in ("vae", "older"):
         save(model, folder / name, {})
     (folder / "policy.safetensors").write_bytes(b"")
     (folder / "policy.json").write_text('{"method": "ppo"}')
@@ -52,11 +53,11 @@ def test_a_saved_model_encodes_as_before(saved, model, street, path):
 
 
 def test_shipped_models_are_found_by_name(shelf, model, street):
-    assert_same_encoding(load("ours"), model, street)
+    assert_same_encoding(load("vae"), model, street)
 
 
 def test_an_unknown_name_is_answered_with_the_shipped_trait_models(shelf):
-    with pytest.raises(InputError, match=r"no trait model theirs; .* shipped model \(older, ours\)"):
+    with pytest.raises(InputError, match=r"no trait model theirs; .* shipped model \(older, vae\)"):
         load("theirs")
 
 
@@ -118,5 +119,13 @@ def test_settings_nobody_can_use_are_reported(saved, settings):
 def test_the_card_tells_what_it_was_given_and_takes_additions(saved):
     add_to_card(saved, {"accuracy": 0.99})
     card = read_card(saved)
-    assert (card["method"], card["latent_size"], card["seed"], card["accuracy"]) == ("ours", 2, 4, 0.99)
+    assert (card["method"], card["latent_size"], card["seed"], card["accuracy"]) == ("vae", 2, 4, 0.99)
     assert load(saved).latent_size == 2
+
+
+@pytest.mark.parametrize(("old", "new"), [("ours", "vae"), ("ours_plus", "cross_window")])
+def test_names_of_the_past_are_answered_with_those_of_today(old, new):
+    with pytest.raises(InputError, match=f"^{old} is now called {new}; use that name$"):
+        load(old)
+    with pytest.raises(InputError, match=f"^{old} is now called {new}; use that name$"):
+        find_method(old)

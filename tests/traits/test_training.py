@@ -42,7 +42,7 @@ def test_a_run_writes_a_model_that_loads_as_trained(windows, small, tmp_path):
     assert_same_weights(load(tmp_path / "run"), model)
     assert not model.training
     card = json.loads((tmp_path / "run" / "model.json").read_text())
-    assert card["method"] == "ours"
+    assert card["method"] == "vae"
     assert card["latent_size"] == 2
     assert card["data"] == "street"
     assert card["windows"] == len(windows.length)
@@ -118,7 +118,7 @@ def test_bad_requests_leave_no_folder(windows, small, tmp_path):
 def test_progress_goes_to_stderr(windows, small, tmp_path, capsys):
     train(windows, small, tmp_path, progress=True)
     shown = capsys.readouterr()
-    assert "traits ours" in shown.err
+    assert "traits vae" in shown.err
     assert shown.out == ""
 
 
@@ -128,7 +128,7 @@ def test_large_networks_train_in_bfloat16(windows, small, tmp_path):
     assert all(value.dtype == torch.float32 and value.isfinite().all() for value in model.state_dict().values())
 
 
-@pytest.mark.parametrize("method", ["classifier", "ours", "ours_plus"])  # at constant speed morton has nothing to learn
+@pytest.mark.parametrize("method", ["classifier", "vae", "cross_window"])  # at constant speed morton has nothing to learn
 def test_two_populations_separate(small, tmp_path, method):
     windows, slow = two_populations(1000)
     labels = slow if METHODS[method].uses_labels else None

@@ -14,7 +14,7 @@ class Budget:
     record_p_conservative: float = 0.5  # share of conservative drivers in the dataset
     traits: TraitSettings = field(default_factory=TraitSettings)
     ppo: PpoSettings = field(default_factory=PpoSettings)  # with the steps of every policy
-    methods: tuple[str, ...] = ("always_go", "ttc", "no_labels", "ours", "oracle")
+    methods: tuple[str, ...] = ("always_go", "ttc", "no_labels", "vae", "oracle")
     p_conservative: tuple[float, ...] = P_CONSERVATIVE
     seeds: tuple[int, ...] = (0, 1, 2)
     episodes: int = 500  # per policy (paper IV-C)

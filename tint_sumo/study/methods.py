@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, refuse_old_name
 from tint_sumo.policy.trait_observation import Encoder, EncoderTraits, NoTraits, OracleTraits, TraitSource
 from tint_sumo.study.rules import AlwaysGo, TimeToCollision
 
@@ -67,6 +67,7 @@ def find_method(name: str) -> Method:
     Raises:
         InputError: there is none.
     """
+    refuse_old_name(name)
     if name not in METHODS:
         raise InputError(f"unknown method {name!r}; choose one of: {', '.join(METHODS)}")
     return METHODS[name]
@@ -93,5 +94,5 @@ def _inferred(encoder: Encoder | None) -> TraitSource:
 register(Rule("always_go", "always go", AlwaysGo))
 register(Rule("ttc", "time to collision", TimeToCollision))
 register(Learned("no_labels", "no labels", lambda _: NoTraits()))
-register(Learned("ours", "paper's method", _inferred, encoder="ours"))
+register(Learned("vae", "paper's method", _inferred, encoder="vae"))
 register(Learned("oracle", "oracle", lambda _: OracleTraits()))

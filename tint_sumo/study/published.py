@@ -8,8 +8,8 @@ RATES_PERCENT: dict[tuple[str, float], tuple[float, float, float]] = {
     ("no_labels", 0.25): (74, 6, 20),
     ("no_labels", 0.4): (80, 18, 2),
     ("no_labels", 0.6): (91, 9, 0),
-    ("ours", 0.25): (81, 16, 3),
-    ("ours", 0.4): (91, 2, 7),
-    ("ours", 0.6): (97, 2, 1),
+    ("vae", 0.25): (81, 16, 3),
+    ("vae", 0.4): (91, 2, 7),
+    ("vae", 0.6): (97, 2, 1),
     ("morton", 0.4): (87, 6, 7),
 }

@@ -45,7 +45,7 @@ def train_policy(
     out: Path,
     *,
     settings: PpoSettings,
-    traits: str | Path = "ours",
+    traits: str | Path = "vae",
     report: Report = silent,
 ) -> Path:
     """Train a policy and write policy.zip, its card policy.json and, where it infers traits, its trait model.

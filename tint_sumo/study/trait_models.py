@@ -20,7 +20,7 @@ from tint_sumo.traits.vae import Vae
 
 
 def train_traits(
-    data: Path, out: Path, *, method: str = "ours", settings: TraitSettings, seed: int = 0, progress: bool = True
+    data: Path, out: Path, *, method: str = "vae", settings: TraitSettings, seed: int = 0, progress: bool = True
 ) -> dict[str, Any]:
     """Train a trait model on two thirds of a dataset's episodes (paper IV-B) and return its card.
 

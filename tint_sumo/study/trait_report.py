@@ -13,7 +13,7 @@ from tint_sumo.files import read_json, whole_file, write_text
 from tint_sumo.study.results import RESULTS
 from tint_sumo.study.tables import markdown_table
 
-COLOURS = {"ours": "#1b6ca8", "ours_plus": "#0b7a3b", "morton": "#c8682c", "classifier": "#555555"}
+COLOURS = {"vae": "#1b6ca8", "cross_window": "#0b7a3b", "morton": "#c8682c", "classifier": "#555555"}
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def _accuracy_table(table: pd.DataFrame) -> str:
         f"\n\nMean ± standard deviation over {int(table['seeds'].max())} training seeds; "
         f"{int(table['training_windows'].mean()):,} training and {int(table['windows'].mean()):,} test windows of "
         "other episodes. Every model is trained and tested with the noise of its row. Position error: root mean square "
-        "of reconstructed (ours) or next (ours_plus, morton) positions, against the measured ones."
+        "of reconstructed (vae) or next (cross_window, morton) positions, against the measured ones."
     )
 
 

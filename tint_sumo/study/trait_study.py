@@ -32,14 +32,14 @@ class TraitStudy:
 
     windows: int = 696_000  # paper IV-B
     settings: TraitSettings = TRAIT_BUDGETS["full"]
-    methods: tuple[str, ...] = ("ours", "ours_plus", "morton", "classifier")
+    methods: tuple[str, ...] = ("vae", "cross_window", "morton", "classifier")
     noises_m: tuple[float, ...] = (0.0, 0.05, 0.1, 0.2)
     seeds: tuple[int, ...] = (0, 1, 2)
     p_conservative: float = 0.5  # of the training data
     other_p: tuple[float, ...] = (0.25, 0.4, 0.6)  # of further test data
     other_windows: int = 30_000
     continuous_windows: int = 240_000
-    continuous_methods: tuple[str, ...] = ("ours", "ours_plus")
+    continuous_methods: tuple[str, ...] = ("vae", "cross_window")
     continuous_latents: tuple[int, ...] = (2, 4)
     continuous_seeds: tuple[int, ...] = (0, 1)
     continuous_epochs: int = 10  # properties without classes take longer to show

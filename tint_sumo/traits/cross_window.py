@@ -1,4 +1,4 @@
-"""Method ``ours_plus``: a latent that must predict another window of the same driver, learnt without labels."""
+"""Method ``cross_window``: a latent that must predict another window of the same driver, learnt without labels."""
 
 import math
 
@@ -33,7 +33,7 @@ class CrossWindow(TraitModel):
     Longer tracks are cut into windows, whose Gaussians multiply (``fuse``).
     """
 
-    method = "ours_plus"
+    method = "cross_window"
     uses_other_window = True
 
     def __init__(self, settings: TraitSettings, latent_size: int = LATENT_SIZE) -> None:

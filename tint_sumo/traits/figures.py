@@ -68,7 +68,7 @@ def plot_reconstructions(model: Vae, windows: Windows, file: Path, *, seed: int 
     """Write a PNG of some full windows beside what the model makes of them.
 
     Args:
-        model: a trained model of method ``ours``.
+        model: a trained model of method ``vae``.
         windows: N windows, some of them of full length.
         file: where the PNG goes.
         seed: of the choice.

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tint_sumo.config import LATENT_SIZE, TraitSettings
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, refuse_old_name
 from tint_sumo.traits.batches import Batch
 from tint_sumo.traits.encoder import WindowEncoder
 
@@ -113,6 +113,7 @@ def find_method(name: Any) -> type[TraitModel]:
     Raises:
         InputError: there is none.
     """
+    refuse_old_name(name)
     if name not in METHODS:
         raise InputError(f"unknown trait method {name!r}; choose one of: {', '.join(sorted(METHODS))}")
     return METHODS[name]

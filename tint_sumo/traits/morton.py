@@ -15,7 +15,7 @@ _STEP_S = EpisodeRules.step_s
 
 @register
 class Morton(TraitModel):
-    """The encoder of ``ours`` with the acceleration as a third feature; a feedforward policy imitates the driver.
+    """The encoder of ``vae`` with the acceleration as a third feature; a feedforward policy imitates the driver.
 
     The policy takes a single state, displacement and gap, and the latent, and gives the acceleration of the next step.
     """

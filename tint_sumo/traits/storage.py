@@ -9,7 +9,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 
 from tint_sumo.config import TraitSettings
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, refuse_old_name
 from tint_sumo.files import read_json, shipped, whole_file, write_json
 from tint_sumo.traits.model import METHODS, TraitModel
 
@@ -81,6 +81,7 @@ def find(name_or_path: str | Path) -> Path:
     for stem in (shipped("models") / given, given / RUN_MODEL, weights):
         if stem.name and _weights_file(stem).is_file():
             return stem
+    refuse_old_name(name_or_path)
     known = sorted(file.stem for file in shipped("models").glob("*.safetensors") if _is_trait_model(file))
     raise InputError(
         f"no trait model {name_or_path}; give the folder of a training run, a .safetensors file, "

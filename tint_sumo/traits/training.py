@@ -33,7 +33,7 @@ def train(
     settings: TraitSettings,
     out: Path,
     *,
-    method: str = "ours",
+    method: str = "vae",
     seed: int = 0,
     latent_size: int = LATENT_SIZE,
     conservative: NDArray[np.bool_] | None = None,

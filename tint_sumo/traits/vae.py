@@ -1,4 +1,4 @@
-"""Method ``ours``: the variational autoencoder of the paper (III-B)."""
+"""Method ``vae``: the variational autoencoder of the paper (III-B)."""
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +21,7 @@ class Vae(TraitModel):
     bounds.
     """
 
-    method = "ours"
+    method = "vae"
 
     def __init__(self, settings: TraitSettings, latent_size: int = LATENT_SIZE) -> None:
         super().__init__(settings, latent_size)

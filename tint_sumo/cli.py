@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 # What a command needs is imported when it runs: --help shall not wait for torch and SUMO.
 # ruff: noqa: PLC0415
 
-BudgetName = Literal["quick", "paper"]
+BudgetName = Literal["quick", "full", "paper"]
 PopulationName = Literal["traits", "continuous"]
 TraitBudgetName = Literal["quick", "full", "paper"]
 
+_MADE = ("dataset", "traits/*/latent.png", "policies/*/policy.safetensors")  # in a study's folder
 RESUMES = ", the same command goes on from here"
 
 
@@ -318,7 +319,7 @@ class EvaluatePolicy(Command):
         with progress_bar(self.model, "case") as report:
             evaluation = evaluate(
                 contender.policy,
-                lambda num_envs: contender.make_venv(num_envs, p_conservative),
+                lambda num_envs: contender.make_venv(num_envs, p_conservative=p_conservative),
                 self.episodes,
                 self.seed,
                 report=report,
@@ -353,7 +354,11 @@ class RunStudy(Command):
 
         out = Path("runs") / self.budget if self.out is None else self.out
         outcome = _report_outcome(run_study(find_budget(self.budget), out, workers=self.workers))
-        made = [out / "dataset", *sorted(out.glob("traits/*/latent.png")), *sorted(out.glob("policies/*/policy.zip"))]
+        made = [
+            out / "dataset",
+            *sorted(out.glob("traits/*/latent.png")),
+            *sorted(out.glob("policies/*/policy.safetensors")),
+        ]
         lines = "\n".join(f"wrote {path}" for path in made)
         return Outcome(f"{outcome.text}\n{lines}", {**outcome.content, "made": [str(path) for path in made]})
 
@@ -472,10 +477,9 @@ def _use_one_thread() -> None:
 
 
 def _report_outcome(report: "StudyReport") -> Outcome:
-    files = {"csv": report.csv_file, "markdown": report.markdown_file, "figure": report.figure_file}
-    text = "\n".join([report.markdown, *(f"wrote {file}" for file in files.values())])
-    content = {"results": [row.to_json() for row in report.rows]}
-    return Outcome(text, {**content, **{name: str(file) for name, file in files.items()}})
+    files = [report.csv_file, report.markdown_file, *report.figure_files]
+    text = "\n".join([report.markdown, *(f"wrote {file}" for file in files)])
+    return Outcome(text, {"results": [row.to_json() for row in report.rows], "files": [str(file) for file in files]})
 
 
 if __name__ == "__main__":

@@ -238,6 +238,7 @@ class PolicySettings:
     joint_sizes: tuple[int, ...] = (150, 100, 64)  # code
     hidden_size: int = 256  # code
     head_sizes: tuple[int, ...] = (256, 256)  # code
+    attention: bool = True  # without, all vehicles count the same (the paper's ablation, IV-D)
     position_gain: float = 1.0  # positions are multiplied by this; observed in units of 20 m, they differ by little
 
 
@@ -257,7 +258,8 @@ class PpoSettings:
     gamma: float = 0.99
     gae_lambda: float = 0.95
     clip_range: float = 0.2
-    ent_coef: float = 0.01
+    ent_coef: float = 0.01  # at the beginning,
+    final_ent_coef: float = 0.01  # and at the end; in between it changes linearly
     vf_coef: float = 0.5
     max_grad_norm: float = 0.5
     total_steps: int = 10_000_000  # paper

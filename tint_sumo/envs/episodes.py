@@ -79,6 +79,11 @@ def require_actions(actions: NDArray[np.integer], num_envs: int) -> None:
         raise InputError(f"actions must be {num_envs} of 0, 1, 2, not {actions.tolist()}")
 
 
+def episode_seed(rng: np.random.Generator) -> int:
+    """Seed of the next episode of an environment with this generator."""
+    return int(rng.integers(_SEED_LIMIT))
+
+
 class Episodes:
     """``num_envs`` episodes at a time, each in its own replica with its own random stream.
 
@@ -101,7 +106,7 @@ class Episodes:
 
     def begin(self, index: int, rng: np.random.Generator) -> None:
         """Start a new episode drawn from an environment's generator."""
-        seed = int(rng.integers(_SEED_LIMIT))
+        seed = episode_seed(rng)
         self.simulation.reset(index, seed)
         self.steps[index] = 0
         if self.settings.position_noise_m > 0.0:

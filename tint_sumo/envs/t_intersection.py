@@ -18,8 +18,9 @@ class TIntersectionEnv(gymnasium.Env[Any, Any]):
     ## Description
     An uncontrolled T-intersection with left-hand traffic (Liu et al., ICRA 2022), simulated by Eclipse SUMO. The ego
     comes up the stem, crosses the lower lane (westbound) and merges into the upper lane (eastbound). Conservative
-    drivers yield to an ego that moves into their lane while they can still stop clear of its way; aggressive drivers do
-    not and hit it. The ego's path is fixed; the agent chooses its desired speed, which a PD controller follows and a safety check can override.
+    drivers yield to an ego that moves into their lane while they can still stop clear of its way; aggressive
+    drivers do not and hit it. The ego's path is fixed; the agent chooses its desired speed, which a PD controller
+    follows and a safety check can override.
 
     ## Action Space
     `Discrete(3)`: desired speed 0, 0.5 or 3 m/s.
@@ -96,7 +97,9 @@ class TIntersectionEnv(gymnasium.Env[Any, Any]):
         require_render_mode(render_mode)
         self.render_mode = render_mode
         self.observation_space = observation_space()
-        self._episodes = Episodes(1, TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, tau_s, backend))
+        self._episodes = Episodes(
+            1, TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, tau_s, backend)
+        )
         self.action_space = action_space()
 
     def reset(

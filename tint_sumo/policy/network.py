@@ -15,8 +15,9 @@ from torch import Tensor, nn
 from tint_sumo.config import PolicySettings
 from tint_sumo.errors import InputError
 from tint_sumo.policy.gru import ResetGru
+from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS
 
-OBSERVATION_KEYS = frozenset({"ego", "vehicles", "mask", "traits"})
+OBSERVATION_KEYS = frozenset({"ego", "vehicles", "mask", TRAITS})
 _FAR_BELOW = -1e9  # score of an empty slot; finite, so that a street without vehicles gives no NaN
 
 
@@ -40,6 +41,7 @@ class AttentionExtractor(BaseFeaturesExtractor):
     - The paper calls the score itself the weight; the code applies softmax over the vehicles, as here.
     - The code's softmax and mean include empty slots. Here neither does, and empty slots are not even computed: what
       they hold has no influence. With no vehicle at all the weighted sum is zero.
+    - Without attention (``PolicySettings.attention``) the weights are equal.
     - The code puts a ReLU on the scores before the softmax and passes each e_i through a 100-100-50 network before the
       sum. Here scores may be negative, and the sum is of the e_i, as in the paper, before one 100-50 layer.
 
@@ -64,7 +66,11 @@ class AttentionExtractor(BaseFeaturesExtractor):
         embedded = settings.embedding_sizes[-1]
         self.position_gain = settings.position_gain
         self.embed = _mlp(position_size + trait_size + ego_size, *settings.embedding_sizes)
-        self.score = nn.Sequential(*_mlp(2 * embedded, *settings.score_sizes), nn.Linear(settings.score_sizes[-1], 1))
+        self.score = (
+            nn.Sequential(*_mlp(2 * embedded, *settings.score_sizes), nn.Linear(settings.score_sizes[-1], 1))
+            if settings.attention
+            else None
+        )
         self.context = _mlp(embedded, settings.context_size)
         self.joint = _mlp(settings.context_size + ego_size, *settings.joint_sizes)
 
@@ -97,13 +103,17 @@ class AttentionExtractor(BaseFeaturesExtractor):
 
     def _weights(self, mask: Tensor, slots: Tensor, rows: Tensor, embedded: Tensor) -> Tensor:
         real = _real(mask)
-        mean = _sum_by_row(embedded, rows, len(mask)) / real.sum(-1, keepdim=True).clamp(min=1)
+        count = real.sum(-1, keepdim=True).clamp(min=1)
+        if self.score is None:
+            return real / count
+        mean = _sum_by_row(embedded, rows, len(mask)) / count
         scores = self._scores(embedded, mean, rows).squeeze(-1).float()
         dense = scores.new_full((mask.numel(),), _FAR_BELOW).index_copy(0, slots, scores)
         return torch.softmax(dense.view_as(mask), dim=-1) * real
 
     def _scores(self, embedded: Tensor, mean: Tensor, rows: Tensor) -> Tensor:
         """The score network on [e_i, mean], (R, 1); its first layer meets each mean once, not once a vehicle."""
+        assert self.score is not None
         first = self.score[0]
         assert isinstance(first, nn.Linear)
         size = embedded.shape[-1]
@@ -111,6 +121,11 @@ class AttentionExtractor(BaseFeaturesExtractor):
         shared = nn.functional.linear(mean.to(embedded.dtype), first.weight[:, size:])
         scores: Tensor = self.score[1:](own + shared.index_select(0, rows))
         return scores
+
+
+def _with_true_traits(parts: dict[str, Any]) -> dict[str, Any]:
+    """Observations, or their spaces, with the true traits in place of the inferred ones."""
+    return {**{key: part for key, part in parts.items() if key != TRUE_TRAITS}, TRAITS: parts[TRUE_TRAITS]}
 
 
 def _last_axis(space: spaces.Dict, key: str) -> int:
@@ -132,6 +147,10 @@ class GruPolicy(ActorCriticPolicy):
     """Actor and critic on a GRU on a features extractor, for Stable-Baselines3.
 
     Tensors of sequences are flat, (T * N, ...) with all N sequences of the first step first.
+
+    Where observations hold "true_traits", only the critic sees them: an attention network of its own, with the true
+    traits in place of the inferred ones, adds to what the GRU tells the critic (asymmetric actor-critic, Pinto et al.
+    2018). The actor, and so ``predict``, needs no such observation.
 
     Args:
         observation_space: any; ``AttentionExtractor`` is the default where it fits, else one of Stable-Baselines3's.
@@ -181,6 +200,11 @@ class GruPolicy(ActorCriticPolicy):
 
     def _build_mlp_extractor(self) -> None:
         self.gru = ResetGru(self.features_dim, self.settings.hidden_size)
+        self.critic_extractor: AttentionExtractor | None = None
+        if isinstance(self.observation_space, spaces.Dict) and TRUE_TRAITS in self.observation_space.spaces:
+            seen = _with_true_traits(dict(self.observation_space.spaces))
+            self.critic_extractor = AttentionExtractor(spaces.Dict(seen), self.settings)
+            self.critic_hint = nn.Linear(self.features_dim, self.settings.hidden_size)
         self.features_dim = self.settings.hidden_size
         super()._build_mlp_extractor()
 
@@ -194,6 +218,13 @@ class GruPolicy(ActorCriticPolicy):
         assert isinstance(features, Tensor)
         outputs, states = self.gru(features.view(*episode_starts.shape, -1), states, episode_starts)
         return outputs.flatten(0, 1), states
+
+    def _latent_critic(self, obs: PyTorchObs, outputs: Tensor) -> Tensor:
+        """The critic's last hidden layer, from observations and the GRU's outputs there."""
+        if self.critic_extractor is not None:
+            assert isinstance(obs, dict)
+            outputs = outputs + self.critic_hint(self.critic_extractor(_with_true_traits(obs)))
+        return self.mlp_extractor.forward_critic(outputs)
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.use_bfloat16 and self.training)
@@ -214,7 +245,8 @@ class GruPolicy(ActorCriticPolicy):
         """
         with self._autocast():
             outputs, states = self._run(obs, states, episode_starts.unsqueeze(0))
-            latent_actor, latent_critic = self.mlp_extractor(outputs)
+            latent_actor = self.mlp_extractor.forward_actor(outputs)
+            latent_critic = self._latent_critic(obs, outputs)
         distribution = self._get_action_dist_from_latent(latent_actor.float())
         actions = distribution.get_actions(deterministic=deterministic)
         values = self.value_net(latent_critic.float())
@@ -233,7 +265,8 @@ class GruPolicy(ActorCriticPolicy):
         """
         with self._autocast():
             outputs, _ = self._run(obs, states, episode_starts)
-            latent_actor, latent_critic = self.mlp_extractor(outputs)
+            latent_actor = self.mlp_extractor.forward_actor(outputs)
+            latent_critic = self._latent_critic(obs, outputs)
         distribution = self._get_action_dist_from_latent(latent_actor.float())
         return self.value_net(latent_critic.float()), distribution.log_prob(actions), distribution.entropy()
 
@@ -241,7 +274,7 @@ class GruPolicy(ActorCriticPolicy):
         """Values (N, 1) of N observations; arguments as in ``forward``."""
         with self._autocast():
             outputs, _ = self._run(obs, states, episode_starts.unsqueeze(0))
-            latent = self.mlp_extractor.forward_critic(outputs)
+            latent = self._latent_critic(obs, outputs)
         values: Tensor = self.value_net(latent.float())
         return values
 

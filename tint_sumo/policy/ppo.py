@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import LinearSchedule, explained_variance, obs_as_tensor
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
@@ -54,7 +54,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
         gamma: discount per step.
         gae_lambda: trade-off of bias and variance in the advantages.
         clip_range: of the probability ratio.
-        ent_coef: weight of the entropy.
+        ent_coef: weight of the entropy; constant, or a function of the progress remaining (1 to 0).
         vf_coef: weight of the values' squared error.
         max_grad_norm: longer gradients are scaled down to this.
         policy_kwargs: further arguments of the policy.
@@ -80,7 +80,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
         gamma: float = _DEFAULTS.gamma,
         gae_lambda: float = _DEFAULTS.gae_lambda,
         clip_range: float = _DEFAULTS.clip_range,
-        ent_coef: float = _DEFAULTS.ent_coef,
+        ent_coef: float | Schedule = _DEFAULTS.ent_coef,
         vf_coef: float = _DEFAULTS.vf_coef,
         max_grad_norm: float = _DEFAULTS.max_grad_norm,
         policy_kwargs: dict[str, Any] | None = None,
@@ -98,7 +98,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
             n_steps=n_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
-            ent_coef=ent_coef,
+            ent_coef=FloatSchedule(ent_coef)(1.0),
             vf_coef=vf_coef,
             max_grad_norm=max_grad_norm,
             use_sde=False,
@@ -114,6 +114,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
         self.n_minibatches = n_minibatches
         self.n_epochs = n_epochs
         self.clip_range = clip_range
+        self.ent_schedule = FloatSchedule(ent_coef)
         if _init_setup_model:
             self._setup_model()
 
@@ -192,6 +193,8 @@ class RecurrentPPO(OnPolicyAlgorithm):
         """Improve the policy on the rollout in the buffer."""
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
+        self.ent_coef = self.ent_schedule(self._current_progress_remaining)
+        self.logger.record("train/ent_coef", self.ent_coef)
         records: dict[str, list[float]] = defaultdict(list)
         for _ in range(self.n_epochs):
             for batch in self.rollout_buffer.sequences(self.n_minibatches):

@@ -1,4 +1,4 @@
-"""The whole study: record, learn traits, train and evaluate every policy, report."""
+"""The whole study: record, learn traits, train and test every policy, report."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -7,26 +7,30 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder
 from tint_sumo.study.budgets import Budget
-from tint_sumo.study.methods import Learned, Rule, find_method
-from tint_sumo.study.policy_job import PolicyJob
+from tint_sumo.study.ceiling_job import CeilingJob
+from tint_sumo.study.loading import shipped_policies
+from tint_sumo.study.methods import Learned, find_method
+from tint_sumo.study.policy_jobs import TestJob, TrainJob
 from tint_sumo.study.pool import Job, run_jobs
 from tint_sumo.study.report import StudyReport, write_report
 from tint_sumo.study.trait_job import DATASET, SEED, TraitJob
 
 
 def plan(budget: Budget, out: Path) -> list[Job]:
-    """All jobs after the recording, those that take or hold up others longest first."""
-    grid = [
-        PolicyJob(method, p, seed, budget.episodes, budget.ppo, out)
-        for seed in budget.seeds
-        for p in budget.p_conservative
-        for method in budget.methods
-    ]
-    found = {name: find_method(name) for name in budget.methods}
-    encoders = {method.encoder: None for method in found.values() if isinstance(method, Learned) and method.encoder}
-    learned = sorted((job for job in grid if isinstance(found[job.method], Learned)), key=lambda job: len(job.needs))
-    rules = [job for job in grid if isinstance(found[job.method], Rule)]
-    return [*(TraitJob(encoder, budget.traits, out) for encoder in encoders), *learned, *rules]
+    """All jobs after the recording, those that hold up others or take longest first, one seed after the other."""
+    found = [find_method(name) for name in budget.methods]
+    learned = [method for method in found if isinstance(method, Learned)]
+    rules = [method.name for method in found if not isinstance(method, Learned)]
+    encoders = dict.fromkeys(method.encoder for method in learned if method.encoder)
+    traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
+    given = rules + (shipped_policies() if budget.with_shipped else [])
+    jobs: list[Job] = [*traits]
+    for seed in budget.seeds:
+        grid = [(method.name, mix, seed) for mix in budget.mixes for method in learned]
+        trainings = [TrainJob(*policy, budget.ppo, budget.traits is None, out) for policy in grid]
+        jobs += sorted(trainings, key=lambda job: len(job.needs))
+        jobs += [TestJob(*policy, budget.tests, out) for policy in grid]
+    return [*jobs, CeilingJob(budget.tests, out), *(TestJob(name, None, 0, budget.tests, out) for name in given)]
 
 
 def run_study(budget: Budget, out: Path, *, workers: int = 2, progress: bool = True) -> StudyReport:
@@ -45,13 +49,14 @@ def run_study(budget: Budget, out: Path, *, workers: int = 2, progress: bool = T
         raise InputError(f"workers must be at least 1, not {workers}")
     jobs = plan(budget, out)
     with claim_folder(out, {"kind": "study", **asdict(budget)}):
-        record(
-            out / DATASET,
-            budget.windows,
-            p_conservative=budget.record_p_conservative,
-            seed=SEED,
-            workers=workers,
-            progress=progress,
-        )
+        if budget.traits is not None:
+            record(
+                out / DATASET,
+                budget.windows,
+                p_conservative=budget.record_p_conservative,
+                seed=SEED,
+                workers=workers,
+                progress=progress,
+            )
         run_jobs(jobs, workers, progress)
         return write_report(out)

@@ -1,7 +1,8 @@
 """Policies by name or path, ready to be evaluated."""
 
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from tint_sumo import traits
 from tint_sumo.config import LATENT_SIZE, Share, ends, is_share
 from tint_sumo.envs.sb3 import TIntersectionVecEnv
-from tint_sumo.errors import InputError
-from tint_sumo.files import read_json, shipped
+from tint_sumo.errors import InputError, refuse_old_name
+from tint_sumo.files import shipped
 from tint_sumo.policy import ActionRepeat, RecurrentPPO, TraitObservation, TraitSource
+from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
 from tint_sumo.study.methods import METHODS, Learned, Policy, Rule, find_learned
+from tint_sumo.study.training import POLICY, digest
+from tint_sumo.traits import TraitModel
 
-POLICY_FILE = "policy.zip"
-CARD_FILE = "policy.json"
-SHIPPED = "shipped"
 DEFAULT_P_CONSERVATIVE = 0.4
 
 
@@ -31,63 +32,101 @@ class Contender:
     p_conservative: Share = DEFAULT_P_CONSERVATIVE  # what it was trained for
     action_repeat: int = 1  # simulation steps per decision
 
-    def make_venv(self, num_envs: int, p_conservative: Share) -> VecEnv:
-        """Environments with the observations the policy takes."""
-        venv: VecEnv = TIntersectionVecEnv(num_envs, p_conservative=p_conservative)
+    def make_venv(self, num_envs: int, **task: Any) -> VecEnv:
+        """Environments with the observations the policy takes; ``task`` as in ``TIntersectionEnv``."""
+        venv: VecEnv = TIntersectionVecEnv(num_envs, **task)
         observed = venv if self.source is None else TraitObservation(venv, self.source())
         return ActionRepeat(observed, self.action_repeat)
 
 
-def load_policy(name_or_path: str | Path) -> Contender:
-    """A hand-written rule by its name, the ``shipped`` policy, or a trained one by its folder or .zip file.
+def load_policy(name_or_path: str | Path, *, allow_pickle: bool = False) -> Contender:
+    """A hand-written rule or a shipped policy by its name, or a trained one by its folder or file.
 
-    The card, a .json file beside the .zip file, tells the method, and where the trait model is.
+    The card, a .json file beside the weights, tells the method, and where the trait model is.
+
+    Args:
+        name_or_path: name, folder of a training run, .safetensors file, or Stable-Baselines3's .zip file with the
+            card beside it.
+        allow_pickle: read .zip files. They can run any code, so allow that only for files you trust.
 
     Raises:
-        InputError: there is no such policy, or its files are missing or damaged.
+        InputError: there is no such policy, or its files are missing, damaged or not to be read.
     """
     method = METHODS.get(str(name_or_path))
     if isinstance(method, Rule):
         return Contender(method.name, method.make())
-    file = _find(name_or_path)
-    card = _read_card(file)
+    if Path(name_or_path).suffix == ".zip":
+        return _load_zip(Path(name_or_path), allow_pickle)
+    stem = find_policy(name_or_path)
+    return replace(_contender(stem, load_policy_network(stem)), name=str(name_or_path))
+
+
+def _load_zip(file: Path, allow_pickle: bool) -> Contender:
+    if not allow_pickle:
+        raise InputError(
+            f"{file} is a pickle, which can run any code when it is read; give the .safetensors file beside it, "
+            "or --allow-pickle if you trust the file"
+        )
+    print(f"reading {file}, a pickle: it can run any code", file=sys.stderr)
+    return replace(_contender(file.with_suffix(""), RecurrentPPO.load(file)), name=str(file))
+
+
+def _contender(stem: Path, policy: Any) -> Contender:
+    card = _checked_card(stem)
     learned = find_learned(card["method"])
-    encoder = None
-    if learned.encoder is not None:
-        encoder = traits.load(file.parent / f"{card['traits']}.safetensors", latent_size=LATENT_SIZE)
-    policy: Any = RecurrentPPO.load(file)
+    encoder = None if learned.encoder is None else _load_encoder(stem, card)
     return Contender(
-        str(name_or_path),
+        stem.name,
         policy,
-        lambda: learned.source(encoder),
+        lambda: learned.make_source(encoder),
         ends(card["p_conservative"]),
         int(card["settings"]["action_repeat"]),
     )
 
 
-def _find(name_or_path: str | Path) -> Path:
+def _load_encoder(stem: Path, card: dict[str, Any]) -> TraitModel:
+    """The trait model beside the policy, or the shipped one of that name: the very one it was trained with."""
+    beside = weights_file(stem.with_name(card["traits"]))
+    encoder = traits.load(beside if beside.is_file() else card["traits"], latent_size=LATENT_SIZE)
+    if digest(encoder) != card.get("traits_sha256"):
+        raise InputError(f"{card_file(stem)} belongs to another trait model {card['traits']}; restore that model")
+    return encoder
+
+
+def find_policy(name_or_path: str | Path) -> Path:
+    """The path of a policy without its suffix.
+
+    Raises:
+        InputError: there is no such policy.
+    """
     given = Path(name_or_path)
-    if str(name_or_path) == SHIPPED:
-        given = shipped("models") / POLICY_FILE
-        if not given.is_file():
-            raise InputError(f"no shipped policy ({given} is missing); reinstall the package or train a policy")
-    for file in (given / POLICY_FILE, given):
-        if file.is_file():
-            return file
+    named = shipped("models") / "policies" / given
+    weights = given.with_suffix("") if given.suffix == ".safetensors" else given
+    for stem in (named, given / POLICY, weights):
+        if stem.name and weights_file(stem).is_file():
+            return stem
+    refuse_old_name(name_or_path)
     if (given / "run.json").exists():
         raise InputError(f"{given} holds a run that is not finished; repeat its command to finish it")
-    rules = ", ".join(name for name, method in METHODS.items() if isinstance(method, Rule))
-    raise InputError(f"no policy {name_or_path}; give {SHIPPED}, {rules}, the folder of a training run or a .zip file")
+    rules = [name for name, method in METHODS.items() if isinstance(method, Rule)]
+    raise InputError(
+        f"no policy {name_or_path}; give {', '.join([*rules, *shipped_policies()])}, the folder of a training run "
+        "or a .safetensors file"
+    )
 
 
-def _read_card(file: Path) -> dict[str, Any]:
-    card_file = file.with_suffix(".json")
-    card = read_json(card_file, "card of the policy")
+def shipped_policies() -> list[str]:
+    """Names of the policies that come with the package, in the order of the methods."""
+    return [name for name in METHODS if weights_file(shipped("models") / "policies" / name).is_file()]
+
+
+def _checked_card(stem: Path) -> dict[str, Any]:
+    card = read_policy_card(stem)
+    refuse_old_name(card.get("method"))
     method = METHODS.get(str(card.get("method")))
-    known = isinstance(method, Learned) and is_share(card.get("p_conservative"))
-    has_traits = isinstance(card.get("traits"), str)
     settings = card.get("settings")
-    known &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
-    if not known or (isinstance(method, Learned) and method.encoder is not None and not has_traits):
-        raise InputError(f"{card_file} is not the card of a policy; restore the file or train the policy again")
+    fits = isinstance(method, Learned) and is_share(card.get("p_conservative"))
+    fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
+    if not fits or (isinstance(method, Learned) and method.encoder and not isinstance(card.get("traits"), str)):
+        raise InputError(f"{card_file(stem)} is not the card of a policy; restore the file or train the policy again")
     return card

@@ -8,12 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.errors import InputError, refuse_old_name
-from tint_sumo.policy.trait_observation import Encoder, EncoderTraits, NoTraits, OracleTraits, TraitSource
+from tint_sumo.policy.trait_sources import (
+    ClassifierTraits,
+    EncoderTraits,
+    NoTraits,
+    OracleTraits,
+    StreamingTraits,
+    TraitSource,
+)
 from tint_sumo.study.rules import AlwaysGo, TimeToCollision
+from tint_sumo.traits import TraitModel
 
 
 class Policy(Protocol):
-    """What drives the ego: a rule, or a Stable-Baselines3 model."""
+    """What drives the ego: a rule, or a Stable-Baselines3 policy."""
 
     def predict(
         self,
@@ -40,8 +48,15 @@ class Learned:
 
     name: str
     title: str
-    source: Callable[[Encoder | None], TraitSource]  # takes the trait model, None if there is none
+    source: Callable[..., TraitSource]  # takes the trait model if there is one
     encoder: str | None = None  # trait method (``tint_sumo.traits.METHODS``) whose model it needs
+    attention: bool = True
+    critic_sees_true_traits: bool = False  # in training; the policy itself never does
+    trained_as: str | None = None  # the method whose training it shares, if it drives with other traits than it learnt
+
+    def make_source(self, encoder: TraitModel | None) -> TraitSource:
+        """A new source of traits."""
+        return self.source() if encoder is None else self.source(encoder)
 
 
 Method = Rule | Learned
@@ -74,7 +89,7 @@ def find_method(name: str) -> Method:
 
 
 def find_learned(name: str) -> Learned:
-    """The same for methods that can be trained.
+    """The same for methods that learn.
 
     Raises:
         InputError: there is none, or it is a hand-written rule.
@@ -86,13 +101,22 @@ def find_learned(name: str) -> Learned:
     return method
 
 
-def _inferred(encoder: Encoder | None) -> TraitSource:
-    assert encoder is not None, "an encoder method is given its trait model"
-    return EncoderTraits(encoder)
-
-
 register(Rule("always_go", "always go", AlwaysGo))
 register(Rule("ttc", "time to collision", TimeToCollision))
-register(Learned("no_labels", "no labels", lambda _: NoTraits()))
-register(Learned("vae", "paper's method", _inferred, encoder="vae"))
-register(Learned("oracle", "oracle", lambda _: OracleTraits()))
+register(Learned("no_labels", "no labels", NoTraits))
+register(Learned("morton", "Morton", EncoderTraits, encoder="morton"))
+register(Learned("vae", "paper's method", EncoderTraits, encoder="vae"))
+register(Learned("no_attention", "paper's, no attention", EncoderTraits, encoder="vae", attention=False))
+register(Learned("cross_window", "cross-window", EncoderTraits, encoder="cross_window"))
+register(Learned("streaming", "streaming", StreamingTraits, encoder="cross_window"))
+register(
+    Learned(
+        "streaming_critic",
+        "streaming, informed critic",
+        StreamingTraits,
+        encoder="cross_window",
+        critic_sees_true_traits=True,
+    )
+)
+register(Learned("ma", "Ma", ClassifierTraits, encoder="classifier", trained_as="oracle"))
+register(Learned("oracle", "oracle", OracleTraits))

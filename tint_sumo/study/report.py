@@ -1,205 +1,234 @@
-"""The results table, as CSV and Markdown, and the bar figure, from the results of the single jobs."""
+"""A study's results as CSV, Markdown and figures, from the results of the single jobs."""
 
 import csv
 import io
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
-from typing import Any
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-
-from tint_sumo.files import whole_file, write_text
-from tint_sumo.study.evaluation import OUTCOMES, Evaluation
+from tint_sumo.config import ends
+from tint_sumo.files import write_text
+from tint_sumo.study.ceiling_job import read_ceilings
+from tint_sumo.study.evaluation import OUTCOMES
+from tint_sumo.study.figures import plot_bars, plot_curves, plot_worlds
 from tint_sumo.study.methods import METHODS
-from tint_sumo.study.published import RATES_PERCENT
-from tint_sumo.study.results import Result, read_results
+from tint_sumo.study.policy_jobs import read_curves
+from tint_sumo.study.results import read_results
+from tint_sumo.study.rows import Row, at_mixes, over_all_mixes, tabulate
+from tint_sumo.study.statistics import difference_interval
 from tint_sumo.study.tables import markdown_table
 
-COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
-INK = {"success": "white", "timeout": "black", "collision": "white"}  # of the numbers on these colours
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the table: all seeds of a method at one P(conservative)."""
-
-    method: str
-    p_conservative: float
-    seeds: tuple[int, ...]
-    evaluation: Evaluation  # the cases of all seeds
-
-    @property
-    def title(self) -> str:
-        return METHODS[self.method].title if self.method in METHODS else self.method
-
-    @property
-    def published(self) -> dict[str, float]:
-        """The paper's rates in percent, empty where it has none."""
-        rates = RATES_PERCENT.get((self.method, self.p_conservative), ())
-        return dict(zip(OUTCOMES, rates, strict=False))
-
-    def to_json(self) -> dict[str, Any]:
-        return {
-            "method": self.method,
-            "p_conservative": self.p_conservative,
-            "seeds": list(self.seeds),
-            **self.evaluation.summary(),
-            "published_percent": self.published or None,
-        }
+Ceilings = Mapping[float, float]  # share of the cases that a careful driver can finish, by P(conservative)
 
 
 @dataclass(frozen=True)
 class StudyReport:
-    """What was written, and the table itself."""
+    """What was written, and the tables themselves."""
 
     rows: tuple[Row, ...]
     markdown: str
     csv_file: Path
     markdown_file: Path
-    figure_file: Path
-
-
-def tabulate(results: Sequence[Result]) -> list[Row]:
-    """One row per P(conservative) and method, methods in the registry's order, seeds pooled."""
-    order = {name: position for position, name in enumerate(METHODS)}
-
-    def key(result: Result) -> tuple[float, int, str]:
-        return result.p_conservative, order.get(result.method, len(order)), result.method
-
-    rows = []
-    for (p_conservative, _, method), group in groupby(sorted(results, key=key), key):
-        members = sorted(group, key=lambda result: result.seed)
-        cases = tuple(case for member in members for case in member.evaluation.cases)
-        rows.append(Row(method, p_conservative, tuple(member.seed for member in members), Evaluation(cases)))
-    return rows
+    figure_files: tuple[Path, ...]
 
 
 def write_report(out: Path) -> StudyReport:
-    """Write results.csv, results.md and results.png into a study's folder.
+    """Write results.csv, results.md and figures into a study's folder.
 
     Raises:
         InputError: there are no results, or a file is damaged.
     """
-    rows = tabulate(read_results(out))
-    report = StudyReport(tuple(rows), to_markdown(rows), out / "results.csv", out / "results.md", out / "results.png")
-    write_text(report.csv_file, to_csv(rows))
-    write_text(report.markdown_file, report.markdown)
-    plot(rows, report.figure_file)
+    rows, ceilings = tabulate(read_results(out)), read_ceilings(out)
+    figures = []
+    if at_mixes(rows):
+        figures.append(plot_bars(at_mixes(rows), out / "results.png"))
+    if over_all_mixes(rows):
+        figures.append(plot_worlds(over_all_mixes(rows), out / "worlds.png"))
+    if curves := read_curves(out):
+        figures.append(plot_curves(curves, out / "curves.png"))
+    markdown = to_markdown(rows, ceilings)
+    report = StudyReport(tuple(rows), markdown, out / "results.csv", out / "results.md", tuple(figures))
+    write_text(report.csv_file, to_csv(rows, ceilings))
+    write_text(report.markdown_file, markdown)
     return report
 
 
-def to_csv(rows: Sequence[Row]) -> str:
-    """Rates and interval ends in percent; the paper's rates in the last three columns."""
+def to_csv(rows: Sequence[Row], ceilings: Ceilings) -> str:
+    """Rates, ends of intervals and spread in percent; the paper's rates in the last three columns."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    measured = [f"{outcome}{part}_percent" for outcome in OUTCOMES for part in ("", "_low", "_high")]
+    measured = [f"{outcome}{part}_percent" for outcome in OUTCOMES for part in ("", "_low", "_high", "_sd")]
+    world = ["p_conservative", "position_noise_m", "tau_s", "training_percent"]
     published = [f"paper_{outcome}_percent" for outcome in OUTCOMES]
-    writer.writerow(["method", "p_conservative", *measured, "navigation_time_s", "episodes", "seeds", *published])
+    closing = ["navigation_time_s", "episodes", "seeds", "ceiling_percent", *published]
+    writer.writerow(["method", "origin", *world, *measured, *closing])
     for row in rows:
-        rates = [row.evaluation.rate(outcome) for outcome in OUTCOMES]
-        numbers = [f"{100.0 * part:.2f}" for rate in rates for part in (rate.value, *rate.interval)]
-        time_s = row.evaluation.navigation_time_s
+        conditions, time_s = row.conditions, row.navigation_time_s
+        ceiling = ceilings.get(_number(row))
+        numbers: list[str] = []
+        for outcome in OUTCOMES:
+            numbers += (_percent(part) for part in (row.rate(outcome), *row.intervals[outcome], row.spread(outcome)))
         writer.writerow(
             [
-                row.method,
-                f"{row.p_conservative:g}",
+                *(row.method, row.origin, _mix(row)),
+                *(f"{value:g}" for value in (conditions.position_noise_m, conditions.tau_s, conditions.percent)),
                 *numbers,
                 "" if time_s is None else f"{time_s:.2f}",
-                len(row.evaluation.cases),
+                row.episodes,
                 " ".join(map(str, row.seeds)),
+                _percent(ceiling),
                 *(row.published.get(outcome, "") for outcome in OUTCOMES),
             ]
         )
     return text.getvalue()
 
 
-def to_markdown(rows: Sequence[Row]) -> str:
-    """The table for readers: rates in percent with 95 % Wilson intervals, the paper's in the last column."""
-    header = ["P(cons.)", "method", *(f"{outcome} %" for outcome in OUTCOMES), "time s", "episodes", "seeds", "paper %"]
-    lines = [header]
+def to_markdown(rows: Sequence[Row], ceilings: Ceilings) -> str:
+    """All tables for readers."""
+    main, worlds = at_mixes(rows), over_all_mixes(rows)
+    parts = []
+    if main:
+        parts += ["## Success by mix of drivers", _success_table(main, ceilings), _SUCCESS_NOTE]
+        parts += ["## All outcomes", _outcome_table(main), _OUTCOME_NOTE]
+        parts += ["## Who is hit", _collision_table(main), _COLLISION_NOTE]
+    if _compared(main):
+        parts += ["## Differences in success", _difference_table(main), _DIFFERENCE_NOTE]
+    if worlds:
+        parts += ["## Other worlds and shorter trainings", _worlds_table(worlds), _WORLDS_NOTE]
+    return "\n\n".join(parts) + "\n"
+
+
+_SUCCESS_NOTE = (
+    "Success in percent of the cases, ± the standard deviation between training seeds. Ceiling: the share of the cases "
+    "in which enough yielding drivers come in time for a driver that enters a lane only before one of them. "
+    "Paper: the published rates of its method, of policies trained for each mix in the authors' simulator."
+)
+_OUTCOME_NOTE = (
+    "Percent of the cases with 95 % intervals: over seeds and cases where there are several seeds (bootstrap), over "
+    "cases alone (Wilson) where there is one. Time: mean of the successful cases. Paper: published success / timeout / "
+    "collision of 500 episodes."
+)
+_COLLISION_NOTE = "Collisions in 1,000 cases by trait and lane of the driver that was hit, over all seeds and mixes."
+_DIFFERENCE_NOTE = (
+    "Difference to another method's success on the same cases, in percentage points with 95 % intervals over seeds and "
+    "cases (bootstrap)."
+)
+_WORLDS_NOTE = (
+    "Success (collision) in percent; every case has its own P(conservative) between 0.1 and 0.9. The first column is "
+    "the world of the training."
+)
+
+
+def _success_table(rows: Sequence[Row], ceilings: Ceilings) -> str:
+    mixes = sorted({_number(row) for row in rows})
+    lines = [["method", "seeds", *(f"P {p:g}" for p in mixes)]]
+    kinds = dict.fromkeys((row.method, row.origin, row.title, row.mix) for row in _by_method(rows))
+    for method, origin, title, mix in kinds:
+        own = {_number(row): row for row in rows if (row.method, row.origin, row.mix) == (method, origin, mix)}
+        cells = [_with_spread(own[p]) if p in own else "-" for p in mixes]
+        lines.append([title, str(len(next(iter(own.values())).seeds)), *cells])
+    if ceilings:
+        lines.append(["ceiling", "", *(_percent(ceilings.get(p), 1) or "-" for p in mixes)])
+    paper = {_number(row): row.published["success"] for row in rows if row.method == "vae" and row.published}
+    if paper:
+        lines.append(["paper", "", *(f"{paper[p]:g}" if p in paper else "-" for p in mixes)])
+    return markdown_table(lines)
+
+
+def _outcome_table(rows: Sequence[Row]) -> str:
+    lines = [["P", "method", *(f"{outcome} %" for outcome in OUTCOMES), "time s", "cases", "seeds", "paper %"]]
     for row in rows:
-        time_s = row.evaluation.navigation_time_s
+        time_s = row.navigation_time_s
         lines.append(
             [
-                f"{row.p_conservative:g}",
+                _mix(row),
                 row.title,
-                *(_rate_text(row.evaluation, outcome) for outcome in OUTCOMES),
+                *(_with_interval(row, outcome) for outcome in OUTCOMES),
                 "-" if time_s is None else f"{time_s:.1f}",
-                str(len(row.evaluation.cases)),
+                str(row.episodes),
                 ", ".join(map(str, row.seeds)),
                 " / ".join(f"{rate:g}" for rate in row.published.values()) or "-",
             ]
         )
-    note = (
-        "Rates with 95 % Wilson intervals over all episodes; they leave out the spread between training seeds.\n"
-        "time: mean navigation time of successful episodes. "
-        "paper: published success / timeout / collision of 500 episodes."
-    )
-    return markdown_table(lines) + "\n\n" + note + "\n"
+    return markdown_table(lines)
 
 
-def _rate_text(evaluation: Evaluation, outcome: str) -> str:
-    rate = evaluation.rate(outcome)
-    low, high = rate.interval
-    return f"{100 * rate.value:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+def _collision_table(rows: Sequence[Row]) -> str:
+    kinds = sorted({kind for row in rows for kind in row.collisions})
+    lines = [["method", *kinds]]
+    for title in dict.fromkeys(row.title for row in _by_method(rows)):
+        own = [row for row in rows if row.title == title]
+        cases = sum(row.episodes * len(row.seeds) for row in own)
+        counts = [sum(row.collisions.get(kind, 0) for row in own) for kind in kinds]
+        lines.append([title, *(f"{1000 * count / cases:.1f}" for count in counts)])
+    return markdown_table(lines)
 
 
-def plot(rows: Sequence[Row], file: Path) -> None:
-    """Stacked bars of success, timeout and collision as in the paper's Fig. 4, one panel per P(conservative)."""
-    panels = [(p, list(group)) for p, group in groupby(rows, key=lambda row: row.p_conservative)]
-    width = sum(1.0 + 0.85 * len(group) for _, group in panels)
-    figure = Figure(figsize=(max(width, 4.5), 4.2), dpi=150, layout="constrained")
-    all_axes = figure.subplots(
-        1, len(panels), sharey=True, squeeze=False, width_ratios=[len(group) for _, group in panels]
-    )[0]
-    for axes, (p_conservative, group) in zip(all_axes, panels, strict=True):
-        _plot_panel(axes, group)
-        axes.set_title(f"P(conservative) = {p_conservative:g}", fontsize=10)
-    all_axes[0].set_ylabel("share of episodes (%)")
-    entries = list(zip(*all_axes[0].get_legend_handles_labels(), strict=True))
-    entries.sort(key=lambda entry: entry[1] not in OUTCOMES)  # the bars first
-    handles, labels = zip(*entries, strict=True)
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    with whole_file(file) as partial:
-        figure.savefig(partial, format="png")
+def _compared(rows: Sequence[Row]) -> list[Row]:
+    """Rows of methods with several trainings."""
+    return [row for row in rows if len(row.seeds) > 1]
 
 
-def _plot_panel(axes: Axes, rows: Sequence[Row]) -> None:
-    positions = range(len(rows))
-    bottom = [0.0] * len(rows)
-    for outcome in OUTCOMES:
-        heights = [100.0 * row.evaluation.rate(outcome).value for row in rows]
-        axes.bar(positions, heights, 0.7, bottom=bottom, color=COLOURS[outcome], label=outcome)
-        for position, start, height in zip(positions, bottom, heights, strict=True):
-            if height >= 5.0:  # thinner parts have no room for a number
-                axes.text(
-                    position,
-                    start + height / 2,
-                    f"{height:.0f}",
-                    ha="center",
-                    va="center",
-                    fontsize=8,
-                    color=INK[outcome],
-                )
-        bottom = [start + height for start, height in zip(bottom, heights, strict=True)]
-    _mark_success(axes, rows)
-    axes.set_xticks(list(positions), [row.title.replace(" ", "\n") for row in rows], fontsize=8)
-    axes.set_ylim(0, 100)
-    axes.spines[["top", "right"]].set_visible(False)
+def _difference_table(rows: Sequence[Row]) -> str:
+    trained = _compared(rows)
+    mixes = sorted({_number(row) for row in trained})
+    lines = [["method", "less", *(f"P {p:g}" for p in mixes)]]
+    for other in ("oracle", "no_labels"):
+        references = {_number(row): row for row in trained if row.method == other}
+        for method in dict.fromkeys(row.method for row in _by_method(trained) if row.method != other):
+            own = {_number(row): row for row in trained if row.method == method}
+            if references and own:
+                cells = [_difference(own.get(p), references.get(p)) for p in mixes]
+                lines.append([next(iter(own.values())).title, next(iter(references.values())).title, *cells])
+    return markdown_table(lines)
 
 
-def _mark_success(axes: Axes, rows: Sequence[Row]) -> None:
-    """The interval of the success rate, and the paper's rate as an arrowhead at the bar's side."""
-    for position, row in enumerate(rows):
-        rate = row.evaluation.rate("success")
-        low, high = rate.interval
-        below, above = 100 * (rate.value - low), 100 * (high - rate.value)
-        label = "95 % interval" if position == 0 else None
-        axes.errorbar(
-            position - 0.2, 100 * rate.value, [[below], [above]], fmt="none", ecolor="black", capsize=3, label=label
-        )
-    published = [row.published.get("success", float("nan")) for row in rows]
-    axes.plot([position + 0.43 for position in range(len(rows))], published, "k<", ms=7, label="success in the paper")
+def _difference(row: Row | None, other: Row | None) -> str:
+    if row is None or other is None or row.episodes != other.episodes:
+        return "-"
+    low, high = difference_interval(row.hits("success"), other.hits("success"))
+    return f"{100 * (row.rate('success') - other.rate('success')):+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
+
+
+def _worlds_table(rows: Sequence[Row]) -> str:
+    worlds = list(dict.fromkeys(row.conditions for row in rows))
+    lines = [["method", *(one.label for one in worlds)]]
+    for title in dict.fromkeys(row.title for row in _by_method(rows)):
+        own = {row.conditions: row for row in rows if row.title == title}
+        cells = [
+            f"{100 * own[one].rate('success'):.1f} ({100 * own[one].rate('collision'):.1f})" if one in own else "-"
+            for one in worlds
+        ]
+        lines.append([title, *cells])
+    return markdown_table(lines)
+
+
+def _by_method(rows: Sequence[Row]) -> list[Row]:
+    """In the registry's order, whatever the conditions."""
+    order = {name: position for position, name in enumerate(METHODS)}
+    return sorted(rows, key=lambda row: (order.get(row.method, len(order)), row.origin))
+
+
+def _number(row: Row) -> float:
+    """P(conservative) of a row's cases; NaN where each case has its own."""
+    p = row.conditions.p_conservative
+    return math.nan if isinstance(p, tuple) else p
+
+
+def _mix(row: Row) -> str:
+    return " to ".join(f"{p:g}" for p in dict.fromkeys(ends(row.conditions.p_conservative)))
+
+
+def _percent(share: float | None, digits: int = 2) -> str:
+    return "" if share is None else f"{100.0 * share:.{digits}f}"
+
+
+def _with_spread(row: Row) -> str:
+    spread, rate = row.spread("success"), 100 * row.rate("success")
+    return f"{rate:.1f}" if spread is None else f"{rate:.1f} ± {100 * spread:.1f}"
+
+
+def _with_interval(row: Row, outcome: str) -> str:
+    low, high = row.intervals[outcome]
+    return f"{100 * row.rate(outcome):.1f} [{100 * low:.1f}, {100 * high:.1f}]"

@@ -1,32 +1,51 @@
-"""How the single policies of a study fared, as files."""
+"""How the policies of a study fared, as files."""
 
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any
 
+from tint_sumo.config import Share
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
+from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import OUTCOMES, Case, Evaluation
 
 RESULTS = "results"  # folder of the results in a study's folder
+TRAINED, GIVEN = "trained", "given"  # where a policy comes from: the study itself, or a rule or the package
+
+
+@dataclass(frozen=True)
+class Tested:
+    """How a policy fared under some conditions."""
+
+    conditions: Conditions
+    evaluation: Evaluation
 
 
 @dataclass(frozen=True)
 class Result:
-    """How one policy fared: one method, P(conservative) and seed."""
+    """How one policy fared: one method, mix of drivers in training, and seed."""
 
     method: str
-    p_conservative: float
+    origin: str  # TRAINED or GIVEN
+    mix: Share | None  # P(conservative) in training; None where the study did not train
     seed: int
-    evaluation: Evaluation
+    tested: tuple[Tested, ...]
 
     def to_json(self) -> dict[str, Any]:
         return {
             "method": self.method,
-            "p_conservative": self.p_conservative,
+            "origin": self.origin,
+            "mix": self.mix,
             "seed": self.seed,
-            **self.evaluation.summary(),
-            "cases": [astuple(case) for case in self.evaluation.cases],
+            "tested": [
+                {
+                    **asdict(one.conditions),
+                    **one.evaluation.summary(),
+                    "cases": [astuple(case) for case in one.evaluation.cases],
+                }
+                for one in self.tested
+            ],
         }
 
     @classmethod
@@ -34,13 +53,28 @@ class Result:
         """Raises InputError if the file is damaged."""
         content = read_json(file, "result of a study")
         try:
-            cases = tuple(Case(outcome, float(time_s), *hit) for outcome, time_s, *hit in content["cases"])
-            result = cls(content["method"], float(content["p_conservative"]), int(content["seed"]), Evaluation(cases))
+            tested = tuple(Tested(_conditions(one), _evaluation(one)) for one in content["tested"])
+            result = cls(content["method"], content["origin"], _share(content["mix"]), int(content["seed"]), tested)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{file} is damaged ({error!r}); remove it and run the study again") from None
+        cases = [case for one in tested for case in one.evaluation.cases]
         if not cases or any(case.outcome not in OUTCOMES for case in cases):
             raise InputError(f"{file} is damaged (no cases, or unknown outcomes); remove it and run the study again")
         return result
+
+
+def _conditions(one: dict[str, Any]) -> Conditions:
+    share = _share(one["p_conservative"])
+    assert share is not None
+    return Conditions(share, float(one["position_noise_m"]), float(one["tau_s"]), int(one["percent"]))
+
+
+def _evaluation(one: dict[str, Any]) -> Evaluation:
+    return Evaluation(tuple(Case(outcome, float(time_s), *hit) for outcome, time_s, *hit in one["cases"]))
+
+
+def _share(value: Any) -> Share | None:
+    return None if value is None else (float(value[0]), float(value[1])) if isinstance(value, list) else float(value)
 
 
 def read_results(out: Path) -> list[Result]:

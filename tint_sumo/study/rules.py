@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.config import POSITION_SCALE_M, SPEED_SCALE_MPS, EpisodeRules, Street, VehicleShape
-from tint_sumo.policy.trait_observation import is_upper
+from tint_sumo.policy.tracks import is_upper
 
 Observation = dict[str, NDArray[np.float32]]
 State = tuple[NDArray[np.float64], ...]

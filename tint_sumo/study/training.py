@@ -1,12 +1,13 @@
 """Training of one policy: interruptible and resumable."""
 
+import csv
 import hashlib
 import io
 import platform
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,23 +19,34 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
+from tint_sumo import ENV_ID
 from tint_sumo import traits as trait_models
 from tint_sumo.config import LATENT_SIZE, PpoSettings, Share, ends, require_share
 from tint_sumo.envs.sb3 import TIntersectionVecEnv
 from tint_sumo.errors import InputError
-from tint_sumo.files import claim_folder, whole_file, write_json
-from tint_sumo.policy import ActionRepeat, RecurrentPPO, TraitObservation
+from tint_sumo.files import claim_folder, whole_file, write_text
+from tint_sumo.policy import ActionRepeat, GruPolicy, OracleTraits, RecurrentPPO, TraitObservation
+from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy
+from tint_sumo.policy.trait_observation import TRUE_TRAITS
 from tint_sumo.study.evaluation import CASE_SEED, OUTCOMES, require_seed
-from tint_sumo.study.loading import CARD_FILE, POLICY_FILE
-from tint_sumo.study.methods import find_learned
+from tint_sumo.study.methods import Learned, find_learned
 from tint_sumo.study.progress import Report, silent
 from tint_sumo.traits import TraitModel
 from tint_sumo.traits.storage import read_card, save
 
 CHECKPOINT_FILE = "checkpoint.zip"
 CHECKPOINT_INTERVAL_S = 15.0
+POLICY = "policy"  # name of the policy in the folder of a run
+ZIP_FILE = "policy.zip"
+CURVE_FILE = "curve.csv"
 TRAITS = "traits"  # name of the trait model beside a policy
-RECENT_EPISODES = 200
+RECENT_EPISODES = 500
+SNAPSHOTS_PERCENT = (25, 50)  # of the training, after which the policy is kept, too
+
+
+def snapshot_stem(out: Path, percent: int) -> Path:
+    """Where a run keeps its policy after some percent of the training, without suffix."""
+    return out / (POLICY if percent == 100 else f"{POLICY}-{percent}")
 
 
 def train_policy(
@@ -45,25 +57,29 @@ def train_policy(
     out: Path,
     *,
     settings: PpoSettings,
-    traits: str | Path = "vae",
+    traits: str | Path | None = None,
+    with_zip: bool = False,
     report: Report = silent,
 ) -> Path:
-    """Train a policy and write policy.zip, its card policy.json and, where it infers traits, its trait model.
+    """Train a policy and write it as policy.safetensors with its card policy.json.
 
-    An interrupted run leaves a checkpoint, and the same call goes on from there. A finished run is not repeated.
+    Beside them stand the policies after 25 and 50 % of the training, the training's curve (outcomes of the last
+    episodes by decisions), a TensorBoard log and, where the method infers traits, its trait model. An interrupted run
+    leaves a checkpoint, and the same call goes on from there. A finished run is not repeated.
 
     Args:
         method: name of a learned method.
         p_conservative: share of conservative drivers it trains among; a range: each episode draws its own.
         steps: decisions of the policy, at least; training ends with a whole rollout.
         seed: of weights, actions and environments, 0 to 1000.
-        out: a new folder, or the one of this very run. A TensorBoard log goes to ``out/tensorboard``.
+        out: a new folder, or the one of this very run.
         settings: network and PPO; its ``total_steps`` is not used.
-        traits: trait model by name or path, for methods that infer traits.
+        traits: trait model by name or path, for methods that infer traits; the shipped one if not given.
+        with_zip: write the policy as Stable-Baselines3's policy.zip, too.
         report: told of the progress.
 
     Returns:
-        The path of policy.zip.
+        The path of policy.safetensors.
 
     Raises:
         InputError: bad values, no such method or trait model, ``out`` holds another run, or its checkpoint is damaged.
@@ -73,7 +89,8 @@ def train_policy(
     require_seed(seed)
     if steps < 1:
         raise InputError(f"steps must be at least 1, not {steps}")
-    encoder = None if learned.encoder is None else trait_models.load(traits, latent_size=LATENT_SIZE)
+    encoder = _load_encoder(learned, traits)
+    settings = replace(settings, policy=replace(settings.policy, attention=learned.attention))
     identity = {
         "kind": "policy",
         "method": method,
@@ -81,27 +98,74 @@ def train_policy(
         "steps": steps,
         "seed": seed,
         "settings": asdict(settings),
-        "traits": None if encoder is None else _digest(encoder),
+        "traits": None if encoder is None else digest(encoder),
     }
+    stem = snapshot_stem(out, 100)
     with claim_folder(out, identity):
-        if (out / CARD_FILE).exists():
-            return out / POLICY_FILE
+        if not card_file(stem).exists():
+            if encoder is not None:
+                save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
+            card = _card(identity, encoder)
+            venv = _training_venv(learned, encoder, p_conservative, settings)
+            try:
+                model = _learn(venv, steps, seed, out, settings, card, report)
+            finally:
+                venv.close()
+            if with_zip:
+                model.save(out / ZIP_FILE)
+            save_policy(model.policy, stem, card)
+            (out / CHECKPOINT_FILE).unlink(missing_ok=True)
+        return stem.with_suffix(".safetensors")
 
-        if encoder is not None:
-            save(encoder, out / TRAITS, read_card(traits))
-        venv = TIntersectionVecEnv(settings.n_envs, p_conservative=p_conservative, time_limit_s=settings.time_limit_s)
-        try:
-            observed = VecMonitor(TraitObservation(venv, learned.source(encoder)))
-            _learn(ActionRepeat(observed, settings.action_repeat), steps, seed, out, settings, report)
-        finally:
-            venv.close()
-        write_json(out / CARD_FILE, _card(identity, encoder is not None))
-        (out / CHECKPOINT_FILE).unlink(missing_ok=True)
-        return out / POLICY_FILE
+
+def share_training(source: Path, method: str, out: Path, traits: str | Path | None = None) -> None:
+    """Write the policies of a finished run as those of a method that is trained in the same way.
+
+    Args:
+        source: folder of the run.
+        method: one that is ``trained_as`` that run's method, and drives with other traits.
+        out: a new folder, or the one of this very call.
+        traits: trait model by name or path; the shipped one if not given.
+    """
+    learned = find_learned(method)
+    encoder = _load_encoder(learned, traits)
+    assert encoder is not None
+    with claim_folder(out, {"kind": "policy", "method": method, "traits": digest(encoder)}):
+        save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
+        for percent in (*SNAPSHOTS_PERCENT, 100):
+            stem = snapshot_stem(source, percent)
+            own = {"method": method, "trained_as": learned.trained_as} | _traits_entries(encoder)
+            save_policy(load_policy_network(stem), snapshot_stem(out, percent), {**read_policy_card(stem), **own})
 
 
-def _learn(venv: VecEnv, steps: int, seed: int, out: Path, settings: PpoSettings, report: Report) -> None:
-    """Train from the checkpoint, if there is one, to ``steps`` and write the policy."""
+def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | None:
+    if learned.encoder is None:
+        return None
+    return trait_models.load(traits or learned.encoder, latent_size=LATENT_SIZE)
+
+
+def _training_venv(
+    learned: Learned, encoder: TraitModel | None, p_conservative: Share, settings: PpoSettings
+) -> VecEnv:
+    """Environments with the traits that the method is trained with."""
+    shown = learned if learned.trained_as is None else find_learned(learned.trained_as)
+    venv = TIntersectionVecEnv(settings.n_envs, p_conservative=p_conservative, time_limit_s=settings.time_limit_s)
+    observed = TraitObservation(venv, shown.make_source(encoder if shown.encoder else None))
+    if learned.critic_sees_true_traits:
+        observed = TraitObservation(observed, OracleTraits(), TRUE_TRAITS)
+    return ActionRepeat(VecMonitor(observed), settings.action_repeat)
+
+
+def _learn(
+    venv: VecEnv,
+    steps: int,
+    seed: int,
+    out: Path,
+    settings: PpoSettings,
+    card: Mapping[str, Any],
+    report: Report,
+) -> RecurrentPPO:
+    """Train from the checkpoint, if there is one, to ``steps``."""
     checkpoint = out / CHECKPOINT_FILE
     model = RecurrentPPO.load(checkpoint, env=venv) if checkpoint.exists() else _new_model(venv, seed, settings)
     done = model.num_timesteps
@@ -111,13 +175,13 @@ def _learn(venv: VecEnv, steps: int, seed: int, out: Path, settings: PpoSettings
             model.set_random_seed(_training_seed(seed, done))
         venv.seed(_training_seed(seed, done))
         report(done, steps, "")
-        watch = _Watch(checkpoint, steps, report)
+        watch = _Watch(out, steps, card, report)
         try:
             model.learn(steps - done, callback=watch, reset_num_timesteps=False)
         except KeyboardInterrupt:
             watch.write_checkpoint()
             raise
-    model.save(out / POLICY_FILE)
+    return model
 
 
 def _new_model(venv: VecEnv, seed: int, settings: PpoSettings) -> RecurrentPPO:
@@ -131,7 +195,7 @@ def _new_model(venv: VecEnv, seed: int, settings: PpoSettings) -> RecurrentPPO:
         gamma=settings.gamma,
         gae_lambda=settings.gae_lambda,
         clip_range=settings.clip_range,
-        ent_coef=settings.ent_coef,
+        ent_coef=LinearSchedule(settings.ent_coef, settings.final_ent_coef, 1.0),
         vf_coef=settings.vf_coef,
         max_grad_norm=settings.max_grad_norm,
         policy_kwargs={"settings": settings.policy},
@@ -145,19 +209,26 @@ def _training_seed(seed: int, done: int) -> int:
 
 
 class _Watch(BaseCallback):
-    """Keeps checkpoints, and reports the outcomes of recent episodes.
+    """Keeps checkpoints, snapshots and the curve of the training, and reports the outcomes of recent episodes.
 
     A checkpoint is the state between two rollouts: within one, steps are counted from which nothing is learnt yet.
     """
 
-    def __init__(self, checkpoint: Path, steps: int, report: Report) -> None:
+    def __init__(self, out: Path, steps: int, card: Mapping[str, Any], report: Report) -> None:
         super().__init__()
-        self._checkpoint = checkpoint
+        self._out = out
         self._steps = steps
+        self._card = card
         self._report = report
         self._recent: deque[str] = deque(maxlen=RECENT_EPISODES)
         self._saved_at = time.monotonic()
         self._state = b""
+        self._curve: list[list[str]] = []
+
+    def _on_training_start(self) -> None:
+        """Go on with the curve up to the checkpoint."""
+        rows = read_curve(self._out) if self.num_timesteps else []
+        self._curve = [row for row in rows if int(row[0]) <= self.num_timesteps]
 
     def _on_rollout_start(self) -> None:
         state = io.BytesIO()
@@ -166,12 +237,23 @@ class _Watch(BaseCallback):
         if time.monotonic() - self._saved_at >= CHECKPOINT_INTERVAL_S:
             self.write_checkpoint()
             self._saved_at = time.monotonic()
+        for percent in SNAPSHOTS_PERCENT:
+            stem = snapshot_stem(self._out, percent)
+            if self.num_timesteps * 100 >= percent * self._steps and not card_file(stem).exists():
+                assert isinstance(self.model.policy, GruPolicy)
+                save_policy(self.model.policy, stem, {**self._card, "decisions": self.num_timesteps})
 
     def write_checkpoint(self) -> None:
         """Write the state at the start of the present rollout, if there is one."""
         if self._state:
-            with whole_file(self._checkpoint) as partial:
+            self._write_curve()
+            with whole_file(self._out / CHECKPOINT_FILE) as partial:
                 partial.write_bytes(self._state)
+
+    def _write_curve(self) -> None:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([("decisions", *OUTCOMES), *self._curve])
+        write_text(self._out / CURVE_FILE, text.getvalue())
 
     def _on_step(self) -> bool:
         infos: list[dict[str, Any]] = self.locals["infos"]
@@ -184,19 +266,40 @@ class _Watch(BaseCallback):
             shares = {outcome: self._recent.count(outcome) / len(self._recent) for outcome in OUTCOMES}
             for outcome, share in shares.items():
                 self.logger.record(f"rollout/{outcome}", share)
+            self._curve.append([str(self.num_timesteps), *(f"{share:.4f}" for share in shares.values())])
             note = f"success {shares['success']:.0%}, collision {shares['collision']:.0%}"
         self._report(min(self.num_timesteps, self._steps), self._steps, note)
 
+    def _on_training_end(self) -> None:
+        self._write_curve()
 
-def _digest(encoder: TraitModel) -> str:
+
+def read_curve(out: Path) -> list[list[str]]:
+    """Rows of a training's curve: decisions, then the shares of the outcomes; none if there is no file yet."""
+    try:
+        lines = (out / CURVE_FILE).read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return []
+    return list(csv.reader(lines[1:]))
+
+
+def digest(encoder: TraitModel) -> str:
+    """What tells a trait model's weights from others."""
     return hashlib.sha256(safetensors.torch.save(encoder.state_dict())).hexdigest()
 
 
-def _card(identity: Mapping[str, Any], has_traits: bool) -> dict[str, Any]:
+def _traits_entries(encoder: TraitModel | None) -> dict[str, Any]:
+    """What the card says of the trait model beside the policy."""
+    if encoder is None:
+        return {"traits": None, "traits_sha256": None}
+    return {"traits": TRAITS, "traits_sha256": digest(encoder)}
+
+
+def _card(identity: Mapping[str, Any], encoder: TraitModel | None) -> dict[str, Any]:
     packages = ("tint_sumo", "libsumo", "torch", "stable-baselines3", "gymnasium", "numpy")
     return {
         **{key: value for key, value in identity.items() if key != "kind"},
-        "traits": TRAITS if has_traits else None,
-        "traits_sha256": identity["traits"],
+        "environment": ENV_ID,
+        **_traits_entries(encoder),
         "versions": {name: version(name) for name in packages} | {"python": platform.python_version()},
     }

@@ -32,8 +32,12 @@ class Classifier(TraitModel):
         """Only ``total``, the cross-entropy of the classes in nats."""
         assert batch.conservative is not None
         mean, _ = self.encode(batch.states, batch.length)
-        logit = self.output(mean).squeeze(-1).float()
-        return {"total": functional.binary_cross_entropy_with_logits(logit, batch.conservative.float())}
+        return {"total": functional.binary_cross_entropy_with_logits(self.logit(mean), batch.conservative.float())}
+
+    def logit(self, latents: Tensor) -> Tensor:
+        """Log-odds (N,) of a conservative driver, from latents (N, latent_size)."""
+        logit: Tensor = self.output(latents).squeeze(-1).float()
+        return logit
 
     def squared_errors_m2(self, batch: Batch) -> Tensor:
         """None: a classifier predicts no positions."""

@@ -29,7 +29,16 @@ class WindowEncoder(nn.Module):
             last = self.gru(embedded)[0][length - 1, torch.arange(len(length), device=length.device)]
         else:
             last = last_states(self.gru, embedded, length)
-        summary = self.summary(last)
+        return self.heads(last)
+
+    def step(self, features: Tensor, hidden: Tensor) -> Tensor:
+        """Hidden states (N, hidden) after one more step of features (N, F)."""
+        weight_ih, weight_hh, bias_ih, bias_hh = self.gru.all_weights[0]
+        return torch.gru_cell(self.embed(features), hidden, weight_ih, weight_hh, bias_ih, bias_hh)
+
+    def heads(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log-variance, each (N, latent_size) float32, of hidden states (N, hidden)."""
+        summary = self.summary(hidden)
         return self.mean_head(summary).float(), self.log_var_head(summary).float()
 
 

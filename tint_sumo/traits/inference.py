@@ -38,8 +38,9 @@ def infer_traits(
 
     Returns:
         vehicle (id), window (0, 1, ... of the vehicle), start_s, end_s, steps, has_leader (one within 20 m at every
-        step), latent_1, ... and std_1, ... (mean and standard deviation of the window's posterior). Of ``cross_window``,
-        also fused_latent_1, ... and fused_std_1, ...: what the vehicle's windows say together, up to this one.
+        step), latent_1, ... and std_1, ... (mean and standard deviation of the window's posterior). Of
+        ``cross_window``, also fused_latent_1, ... and fused_std_1, ...: what the vehicle's windows say together, up
+        to this one.
 
     Raises:
         InputError: unusable data, network, length or model.

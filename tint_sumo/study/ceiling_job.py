@@ -1,0 +1,46 @@
+"""The study's job of finding what a careful driver can reach at best."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tint_sumo.files import read_json, write_json
+from tint_sumo.study.budgets import Conditions, Test
+from tint_sumo.study.ceiling import ceiling
+from tint_sumo.study.policy_jobs import CASES
+from tint_sumo.study.progress import Report
+
+CEILINGS_FILE = "ceilings.json"
+
+
+@dataclass(frozen=True)
+class CeilingJob:
+    """Compute the ceiling for each P(conservative) that policies are tested at."""
+
+    tests: tuple[Test, ...]
+    out: Path  # of the study
+
+    name = "ceilings"
+    needs: tuple[str, ...] = ()
+
+    def is_done(self) -> bool:
+        return (self.out / CEILINGS_FILE).exists()
+
+    def run(self, report: Report) -> str:
+        wanted = {
+            one.p_conservative: test.episodes
+            for test in self.tests
+            for one in test.conditions
+            if isinstance(one.p_conservative, float) and one == Conditions(one.p_conservative)
+        }
+        found = {}
+        for done, (p_conservative, episodes) in enumerate(wanted.items()):
+            report(done, len(wanted), f"P {p_conservative:g}")
+            found[f"{p_conservative:g}"] = ceiling(p_conservative, episodes, CASES)
+        write_json(self.out / CEILINGS_FILE, found)
+        return ", ".join(f"P {p}: {share:.1%}" for p, share in found.items())
+
+
+def read_ceilings(out: Path) -> dict[float, float]:
+    """Ceilings by P(conservative); none if the study has not computed them."""
+    file = out / CEILINGS_FILE
+    return {float(p): share for p, share in read_json(file, "ceilings").items()} if file.exists() else {}

@@ -1,0 +1,158 @@
+"""Figures of a study's results."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tint_sumo.config import ends
+from tint_sumo.files import whole_file
+from tint_sumo.study.budgets import Conditions
+from tint_sumo.study.evaluation import OUTCOMES
+from tint_sumo.study.methods import METHODS
+from tint_sumo.study.rows import Row
+
+COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
+INK = {"success": "white", "timeout": "black", "collision": "white"}  # of the numbers on these colours
+_MARKERS = "osD^vP*Xh<>"
+_PANELS = 3  # in a row
+
+
+def plot_bars(rows: Sequence[Row], file: Path) -> Path:
+    """Stacked bars of success, timeout and collision as in the paper's Fig. 4, one panel per P(conservative)."""
+    panels = [(p, list(group)) for p, group in groupby(rows, key=lambda row: ends(row.conditions.p_conservative)[0])]
+    columns = min(len(panels), _PANELS)
+    lines = -(-len(panels) // columns)
+    height = max(len(group) for _, group in panels)
+    size = (1.6 + 3.4 * columns, lines * (1.1 + 0.34 * height))
+    figure = Figure(figsize=size, dpi=150, layout="constrained")
+    all_axes = figure.subplots(lines, columns, sharex=True, squeeze=False)
+    for axes in all_axes.flat[len(panels) :]:
+        axes.set_visible(False)
+    for position, (axes, (p_conservative, group)) in enumerate(zip(all_axes.flat, panels, strict=False)):
+        _plot_panel(axes, group)
+        axes.set_title(f"P(conservative) = {p_conservative:g}", fontsize=10)
+        axes.tick_params(labelbottom=True)
+        if position % columns:
+            axes.tick_params(labelleft=False)
+    figure.supxlabel("share of the cases (%)", fontsize=10)
+    entries = dict(zip(*reversed(all_axes[0, 0].get_legend_handles_labels()), strict=True))
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    return _write(figure, file)
+
+
+def _plot_panel(axes: Axes, rows: Sequence[Row]) -> None:
+    positions = range(len(rows))
+    left = [0.0] * len(rows)
+    for outcome in OUTCOMES:
+        widths = [100.0 * row.rate(outcome) for row in rows]
+        axes.barh(positions, widths, 0.72, left=left, color=COLOURS[outcome], label=outcome)
+        for position, start, width in zip(positions, left, widths, strict=True):
+            if width >= 8.0:  # thinner parts have no room for a number
+                text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "color": INK[outcome]}
+                axes.text(start + width / 2, position, f"{width:.0f}", **text)
+        left = [start + width for start, width in zip(left, widths, strict=True)]
+    ends_percent = 100.0 * np.array([row.intervals["success"] for row in rows]).T
+    middle = np.array([100.0 * row.rate("success") for row in rows])
+    errors = np.abs(ends_percent - middle)
+    axes.errorbar(
+        middle, positions, xerr=errors, fmt="none", ecolor="black", capsize=2, lw=1, label="95 % interval of success"
+    )
+    published = [row.published.get("success", float("nan")) for row in rows]
+    if not np.isnan(published).all():
+        axes.plot(published, [position - 0.44 for position in positions], "kv", ms=4, label="success in the paper")
+    axes.set_yticks(list(positions), [row.title for row in rows], fontsize=8)
+    axes.set_xlim(0, 100)
+    axes.invert_yaxis()
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Path:
+    """Success in training against decisions: the mean over seeds, and the range between them as a band.
+
+    Args:
+        curves: of each method, a frame per seed with columns decisions and success.
+        file: of the PNG.
+    """
+    figure = Figure(figsize=(7.5, 4.6), dpi=150, layout="constrained")
+    axes = figure.subplots()
+    for position, (method, seeds) in enumerate(curves.items()):
+        shares = [one.set_index("decisions")["success"].rolling(5, min_periods=1).mean() for one in seeds]
+        percent = 100.0 * pd.concat(shares, axis=1).dropna()
+        style: dict[str, Any] = {
+            "color": f"C{position}",
+            "marker": _MARKERS[position],
+            "markevery": 0.12,
+            "ms": 4,
+            "lw": 1.3,
+        }
+        axes.plot(percent.index, percent.mean(axis=1), label=METHODS[method].title, **style)
+        axes.fill_between(
+            percent.index.to_numpy(), percent.min(axis=1), percent.max(axis=1), color=f"C{position}", alpha=0.12, lw=0
+        )
+    axes.set(xlabel="decisions", ylabel="success in training, all mixes (%)", ylim=(0, 100))
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False, fontsize=8, ncols=2)
+    return _write(figure, file)
+
+
+def plot_worlds(rows: Sequence[Row], file: Path) -> Path:
+    """Success in worlds other than the training's, and after parts of the training; a line per method."""
+    figure = Figure(figsize=(11.0, 4.2), dpi=150, layout="constrained")
+    all_axes = figure.subplots(1, 3, sharey=True)
+    panels = (
+        ("position_noise_m", "noise on positions (m)"),
+        ("tau_s", "headway tau of the drivers (s)"),
+        ("percent", "part of the training (%)"),
+    )
+    for axes, (name, title) in zip(all_axes, panels, strict=True):
+        for position, (_, own) in enumerate(_by_method(rows).items()):
+            _plot_line(axes, own, name, position)
+        axes.set_xlabel(title)
+        axes.grid(alpha=0.25)
+    all_axes[0].set_ylabel("success, all mixes (%)")
+    entries = all_axes[0].get_legend_handles_labels()
+    figure.legend(*entries, loc="outside lower center", ncols=6, frameon=False, fontsize=8)
+    return _write(figure, file)
+
+
+def _plot_line(axes: Axes, rows: Sequence[Row], name: str, position: int) -> None:
+    """Rows that differ from the training's world in one condition."""
+    base = Conditions(rows[0].conditions.p_conservative)
+    shown = [row for row in rows if replace(row.conditions, **{name: getattr(base, name)}) == base]
+    points = {getattr(row.conditions, name): row for row in shown}
+    if points:
+        values = sorted(points)
+        percent = np.array([100.0 * points[value].rate("success") for value in values])
+        limits = np.array([[100.0 * end for end in points[value].intervals["success"]] for value in values]).T
+        style: dict[str, Any] = {
+            "color": f"C{position}",
+            "marker": _MARKERS[position],
+            "ms": 4,
+            "lw": 1.2,
+            "capsize": 2,
+        }
+        axes.errorbar(values, percent, yerr=np.abs(limits - percent), label=rows[0].title, **style)
+
+
+def _style(position: int) -> dict[str, Any]:
+    return {"color": f"C{position}", "marker": _MARKERS[position], "ms": 4, "lw": 1.2}
+
+
+def _by_method(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    found: dict[str, list[Row]] = {name: [] for name in METHODS}
+    for row in rows:
+        found[row.method].append(row)
+    return {name: own for name, own in found.items() if own}
+
+
+def _write(figure: Figure, file: Path) -> Path:
+    with whole_file(file) as partial:
+        figure.savefig(partial, format="png")
+    return file

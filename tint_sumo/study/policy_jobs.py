@@ -1,0 +1,158 @@
+"""The study's jobs of training policies and of testing them."""
+
+import time
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import pandas as pd
+import torch
+
+from tint_sumo.config import PpoSettings, Share, ends
+from tint_sumo.files import write_json
+from tint_sumo.study.budgets import Conditions, Test
+from tint_sumo.study.evaluation import Evaluation, evaluate
+from tint_sumo.study.loading import load_policy
+from tint_sumo.study.methods import METHODS, Rule, find_learned, find_method
+from tint_sumo.study.pool import THREADS_PER_JOB
+from tint_sumo.study.progress import Report
+from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Result, Tested
+from tint_sumo.study.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
+
+CASES = 0  # the set of cases that all policies are tested on
+
+
+@dataclass(frozen=True)
+class TrainJob:
+    """Train a policy."""
+
+    method: str
+    mix: Share
+    seed: int
+    settings: PpoSettings
+    shipped_traits: bool  # rather than a trait model of the study
+    out: Path  # of the study
+
+    @property
+    def name(self) -> str:
+        return f"train {label(self.method, self.mix, self.seed)}"
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        method = find_learned(self.method)
+        traits = (f"traits {method.encoder}",) if method.encoder and not self.shipped_traits else ()
+        shared = (f"train {label(method.trained_as, self.mix, self.seed)}",) if method.trained_as else ()
+        return traits + shared
+
+    @property
+    def folder(self) -> Path:
+        return self._folder(self.method)
+
+    def _folder(self, method: str) -> Path:
+        return self.out / "policies" / label(method, self.mix, self.seed)
+
+    def is_done(self) -> bool:
+        return (self.folder / f"{POLICY}.json").exists()
+
+    def run(self, report: Report) -> str:
+        torch.set_num_threads(THREADS_PER_JOB)
+        began = time.monotonic()
+        method = find_learned(self.method)
+        traits = None if self.shipped_traits else self.out / "traits" / str(method.encoder) / "model.safetensors"
+        if method.trained_as is not None:
+            share_training(self._folder(method.trained_as), self.method, self.folder, traits)
+            return f"shares the training of {method.trained_as}"
+        train_policy(
+            self.method,
+            self.mix,
+            self.settings.total_steps,
+            self.seed,
+            self.folder,
+            settings=self.settings,
+            traits=traits,
+            report=report,
+        )
+        return f"trained ({time.monotonic() - began:.0f} s)"
+
+
+@dataclass(frozen=True)
+class TestJob:
+    """Test a trained policy, a shipped one, or a rule."""
+
+    method: str
+    mix: Share | None  # of its training; None: a rule or a shipped policy
+    seed: int
+    tests: tuple[Test, ...]
+    out: Path  # of the study
+
+    @property
+    def name(self) -> str:
+        return f"test {self._label}"
+
+    @property
+    def _label(self) -> str:
+        return label(self.method, self.mix, self.seed)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        return () if self.mix is None else (f"train {self._label}",)
+
+    @property
+    def result_file(self) -> Path:
+        return self.out / RESULTS / f"{self._label}.json"
+
+    def is_done(self) -> bool:
+        return self.result_file.exists()
+
+    def run(self, report: Report) -> str:
+        torch.set_num_threads(THREADS_PER_JOB)
+        began = time.monotonic()
+        wanted = [(one, test.episodes) for test in self.tests for one in test.conditions if self._meets(one)]
+        total, done = sum(episodes for _, episodes in wanted), 0
+        tested: list[Tested] = []
+        for conditions, episodes in wanted:
+            evaluation = self._test(conditions, episodes, partial(_shifted, report, done, total))
+            tested.append(Tested(conditions, evaluation))
+            done += episodes
+        origin = GIVEN if self.mix is None else TRAINED
+        write_json(self.result_file, Result(self.method, origin, self.mix, self.seed, tuple(tested)).to_json())
+        successes = ", ".join(f"{one.evaluation.rate('success').value:.1%}" for one in tested)
+        return f"success {successes} ({time.monotonic() - began:.0f} s)"
+
+    def _meets(self, conditions: Conditions) -> bool:
+        """Whether the policy is tested there: among drivers it was trained for, and if it was trained at all."""
+        if self.mix is None:
+            return conditions.percent == 100
+        low, high = ends(self.mix)
+        tested_low, tested_high = ends(conditions.p_conservative)
+        return low <= tested_low and tested_high <= high
+
+    def _test(self, conditions: Conditions, episodes: int, report: Report) -> Evaluation:
+        if self.mix is None:
+            contender = load_policy(self.method)
+        else:
+            folder = self.out / "policies" / self._label
+            contender = load_policy(snapshot_stem(folder, conditions.percent).with_suffix(".safetensors"))
+        world = {key: value for key, value in asdict(conditions).items() if key != "percent"}
+        return evaluate(
+            contender.policy, lambda num_envs: contender.make_venv(num_envs, **world), episodes, CASES, report=report
+        )
+
+
+def _shifted(report: Report, before: int, total: int, done: int, _: int, note: str) -> None:
+    """Report cases of one test among those of all tests."""
+    report(before + done, total, note)
+
+
+def label(method: str, mix: Share | None, seed: int) -> str:
+    """Name of a policy in the files of a study."""
+    if mix is None:
+        return method if isinstance(find_method(method), Rule) else f"{method}-shipped"
+    low, high = ends(mix)
+    return f"{method}-P{low:g}-seed{seed}" if low == high else f"{method}-P{low:g}to{high:g}-seed{seed}"
+
+
+def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
+    """Curves of the trainings of the study in ``out``, one per seed, by method in the registry's order."""
+    found = {name: sorted((out / "policies").glob(f"{name}-P*/{CURVE_FILE}")) for name in METHODS}
+    return {name: [pd.read_csv(file) for file in files] for name, files in found.items() if files}

@@ -1,0 +1,140 @@
+"""The rows of the results: all seeds of a method under the same conditions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from tint_sumo.config import Share
+from tint_sumo.study.budgets import Conditions
+from tint_sumo.study.evaluation import OUTCOMES, Evaluation
+from tint_sumo.study.methods import METHODS, Learned
+from tint_sumo.study.published import RATES_PERCENT
+from tint_sumo.study.results import GIVEN, Result
+from tint_sumo.study.statistics import Hits, Interval, rate_interval
+
+
+@dataclass(frozen=True)
+class Row:
+    """Policies of one method that differ by their training's seed alone, tested on the same cases."""
+
+    method: str
+    origin: str
+    mix: Share | None  # P(conservative) in training
+    conditions: Conditions
+    seeds: tuple[int, ...]
+    evaluations: tuple[Evaluation, ...]  # of each seed
+
+    @property
+    def title(self) -> str:
+        method = METHODS.get(self.method)
+        title = self.method if method is None else method.title
+        return f"{title} (shipped)" if self.origin == GIVEN and isinstance(method, Learned) else title
+
+    @property
+    def episodes(self) -> int:
+        """Number of cases."""
+        return len(self.evaluations[0].cases)
+
+    def hits(self, outcome: str) -> Hits:
+        """(seeds, cases): where there was an outcome."""
+        return np.array([[case.outcome == outcome for case in one.cases] for one in self.evaluations])
+
+    def rate(self, outcome: str) -> float:
+        return float(self.hits(outcome).mean())
+
+    def spread(self, outcome: str) -> float | None:
+        """Standard deviation between the seeds; None with one seed."""
+        rates = self.hits(outcome).mean(axis=1)
+        return float(rates.std(ddof=1)) if len(rates) > 1 else None
+
+    @cached_property
+    def intervals(self) -> dict[str, Interval]:
+        """95 % intervals of the outcomes: over seeds and cases, or over cases alone where there is one seed."""
+        if len(self.seeds) == 1:
+            return {outcome: self.evaluations[0].rate(outcome).interval for outcome in OUTCOMES}
+        return {outcome: rate_interval(self.hits(outcome)) for outcome in OUTCOMES}
+
+    @property
+    def navigation_time_s(self) -> float | None:
+        """Mean time of successful episodes; None without any."""
+        return Evaluation(tuple(case for one in self.evaluations for case in one.cases)).navigation_time_s
+
+    @property
+    def collisions(self) -> dict[str, int]:
+        """Number of collisions by trait and lane of the driver that was hit, over all seeds."""
+        return Evaluation(tuple(case for one in self.evaluations for case in one.cases)).collisions
+
+    @property
+    def published(self) -> dict[str, float]:
+        """The paper's rates in percent, empty where it has none; for its own conditions alone."""
+        p = self.conditions.p_conservative
+        if not isinstance(p, float) or self.conditions != Conditions(p):
+            return {}
+        return dict(zip(OUTCOMES, RATES_PERCENT.get((self.method, p), ()), strict=False))
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "method": self.method,
+            "origin": self.origin,
+            "p_conservative": self.conditions.p_conservative,
+            "position_noise_m": self.conditions.position_noise_m,
+            "tau_s": self.conditions.tau_s,
+            "percent": self.conditions.percent,
+            "seeds": list(self.seeds),
+            "episodes": self.episodes,
+            **{outcome: self.rate(outcome) for outcome in OUTCOMES},
+            "intervals": {outcome: list(interval) for outcome, interval in self.intervals.items()},
+            "success_sd": self.spread("success"),
+            "navigation_time_s": self.navigation_time_s,
+            "collisions": self.collisions,
+            "published_percent": self.published or None,
+        }
+
+
+def tabulate(results: Sequence[Result]) -> list[Row]:
+    """One row per conditions, origin, method and mix in training; methods in the registry's order."""
+    order = {name: position for position, name in enumerate(METHODS)}
+    flat = [(result, one) for result in results for one in result.tested]
+
+    def key(pair: tuple[Result, Any]) -> tuple[Any, ...]:
+        result, conditions = pair[0], pair[1].conditions
+        return (
+            -conditions.percent,
+            conditions.position_noise_m,
+            abs(conditions.tau_s - 1.0),
+            conditions.tau_s,
+            isinstance(conditions.p_conservative, tuple),
+            conditions.p_conservative,
+            order.get(result.method, len(order)),
+            result.method,
+            result.origin,
+            str(result.mix),
+        )
+
+    rows = []
+    for _, group in groupby(sorted(flat, key=key), key):
+        members = sorted(group, key=lambda pair: pair[0].seed)
+        first, tested = members[0]
+        seeds = tuple(result.seed for result, _ in members)
+        evaluations = tuple(one.evaluation for _, one in members)
+        rows.append(Row(first.method, first.origin, first.mix, tested.conditions, seeds, evaluations))
+    return rows
+
+
+def at_mixes(rows: Sequence[Row]) -> list[Row]:
+    """The rows of the main table: fully trained, the default world, one P(conservative) each."""
+    return [
+        row
+        for row in rows
+        if isinstance(row.conditions.p_conservative, float)
+        and row.conditions == Conditions(row.conditions.p_conservative)
+    ]
+
+
+def over_all_mixes(rows: Sequence[Row]) -> list[Row]:
+    """The rows of other worlds and parts of the training, where every case has a mix of its own."""
+    return [row for row in rows if isinstance(row.conditions.p_conservative, tuple)]

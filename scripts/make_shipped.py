@@ -1,14 +1,14 @@
-"""Remake what data/ ships: trait models and their tables, the policy, pictures. Resumes where it was interrupted.
+"""Remake what data/ ships: trait models, policies, their tables, pictures. Resumes where it was interrupted.
 
     .venv/bin/python scripts/make_shipped.py WORK_FOLDER
 
-Takes about an hour and a half on two cores. The commands it runs are those of data/README.md.
+Takes about three hours on two cores. The commands it runs are those of data/README.md.
 """
 
 import shutil
 import sys
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -17,18 +17,20 @@ from PIL import Image
 
 from tint_sumo import ENV_ID
 from tint_sumo.cli import main as tint_sumo
+from tint_sumo.files import write_json
+from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.study.budgets import BUDGETS
-from tint_sumo.study.progress import progress_bar
-from tint_sumo.study.training import train_policy
+from tint_sumo.study.methods import Learned, find_method
+from tint_sumo.study.policy_jobs import label
+from tint_sumo.study.results import read_results
+from tint_sumo.study.rows import at_mixes, tabulate
+from tint_sumo.study.training import POLICY
 from tint_sumo.study.trait_models import evaluate_traits
 from tint_sumo.study.trait_study import TraitStudy
 from tint_sumo.traits.storage import add_to_card
 
 DATA = Path(__file__).resolve().parents[1] / "data"
-QUICK = BUDGETS["quick"].ppo
 SHIPPED_TRAITS = {"vae": 0.0, "cross_window": 0.05, "morton": 0.0, "classifier": 0.0}  # and the noise in training, m
-POLICY_STEPS = 1_200_000
-POLICY_SETTINGS = replace(QUICK, n_epochs=4, n_minibatches=4, learning_rate=1e-3, ent_coef=0.005, time_limit_s=50.0)
 
 
 def run(*arguments: str) -> None:
@@ -58,12 +60,34 @@ def make_traits(work: Path) -> None:
     copy(work / "reconstruction.png", DATA / "images" / "reconstruction.png")
 
 
-def make_policy(work: Path) -> None:
-    policy = work / "vae04"
-    with progress_bar("policy vae", "step") as report:
-        train_policy("vae", 0.4, POLICY_STEPS, 0, policy, settings=POLICY_SETTINGS, traits="vae", report=report)
-    for name in ("policy.zip", "policy.json", "traits.safetensors", "traits.json"):
-        copy(policy / name, DATA / "models" / name)
+def make_policies(work: Path) -> None:
+    """The navigation study: its tables and figures, and the policy of each method with the first seed."""
+    study = work / "navigation"
+    run("study", "run", "--budget", "full", "--out", str(study))
+    for suffix in (".csv", ".md"):
+        copy(study / f"results{suffix}", DATA / "results" / f"navigation{suffix}")
+    for source, target in (
+        ("results.png", "navigation.png"),
+        ("worlds.png", "worlds.png"),
+        ("curves.png", "curves.png"),
+    ):
+        copy(study / source, DATA / "images" / target)
+    rows = [row.to_json() for row in at_mixes(tabulate(read_results(study)))]
+    budget = BUDGETS["full"]
+    for name in budget.methods:
+        method = find_method(name)
+        if isinstance(method, Learned):
+            run_stem = study / "policies" / label(name, budget.mixes[0], budget.seeds[0]) / POLICY
+            ship_policy(run_stem, method, [row for row in rows if row["method"] == name])
+
+
+def ship_policy(run_stem: Path, method: Learned, rows: list[dict[str, Any]]) -> None:
+    """Copy a policy; its card names the shipped trait model, and tells how the method fared over all seeds."""
+    shipped = DATA / "models" / "policies" / method.name
+    copy(weights_file(run_stem), weights_file(shipped))
+    shown = ("seeds", "episodes", "success", "timeout", "collision", "success_sd")
+    results = {f"P {row['p_conservative']:g}": {key: row[key] for key in shown} for row in rows}
+    write_json(card_file(shipped), {**read_policy_card(run_stem), "traits": method.encoder, "results": results})
 
 
 def copy(source: Path, target: Path) -> None:
@@ -88,4 +112,4 @@ if __name__ == "__main__":
     torch.set_num_threads(1)  # the networks are small
     make_pictures()
     make_traits(Path(sys.argv[1]))
-    make_policy(Path(sys.argv[1]))
+    make_policies(Path(sys.argv[1]))

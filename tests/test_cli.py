@@ -19,8 +19,10 @@ from tint_sumo import traits
 from tint_sumo.cli import main
 from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.recorder import record
+from tint_sumo.study.budgets import Conditions
+from tint_sumo.study.evaluation import Case, Evaluation
 from tint_sumo.study.methods import METHODS, Learned
-from tint_sumo.study.results import RESULTS
+from tint_sumo.study.results import GIVEN, RESULTS, Result, Tested
 from tint_sumo.traits.storage import save
 
 PATIENCE_S = 100.0
@@ -197,27 +199,49 @@ def test_policy_train(tmp_path: Path, trait_model: Path, capsys: pytest.CaptureF
     argv = ("policy", "train", "--method", "vae", "--steps", 1, "--traits", trait_model, "--out", out)
     printed = run(capsys, *argv, "--p-conservative", 0.25)
     assert printed == {
-        "model": str(out / "policy.zip"), "method": "vae", "p_conservative": 0.25, "steps": 1, "seed": 0
+        "model": str(out / "policy.safetensors"), "method": "vae", "p_conservative": [0.25], "steps": 1, "seed": 0
     }  # fmt: skip
     before = files(out)
     assert "another run" in refuse(capsys, *argv, "--p-conservative", 0.3)
     assert files(out) == before
     found = run(capsys, "policy", "evaluate", "--model", out, "--episodes", 2)
-    assert found["p_conservative"] == 0.25
+    assert found["p_conservative"] == [0.25, 0.25]
+
+
+def test_a_pickled_policy_is_read_on_request_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    run(capsys, "policy", "train", "--method", "oracle", "--steps", 1, "--zip", "--out", out)
+    argv = ("policy", "evaluate", "--model", out / "policy.zip", "--episodes", 2)
+    assert "--allow-pickle if you trust the file" in refuse(capsys, *argv)
+    assert main([*map(str, argv), "--allow-pickle"]) == 0
+    printed = capsys.readouterr()
+    assert "a pickle: it can run any code" in printed.err
+    of_zip = printed.out
+    assert main(["policy", "evaluate", "--model", str(out), "--episodes", "2"]) == 0
+    assert capsys.readouterr().out == of_zip
+
+
+def test_policies_are_evaluated_in_other_worlds(capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ("policy", "evaluate", "--model", "ttc", "--episodes", 12, "--p-conservative", 0.2, 0.8)
+    plain, other = run(capsys, *argv), run(capsys, *argv, "--noise", 0.2, "--tau", 0.5)
+    assert plain["p_conservative"] == other["p_conservative"] == [0.2, 0.8]
+    assert (other["position_noise_m"], other["tau_s"]) == (0.2, 0.5)
+    assert plain["navigation_time_s"] != other["navigation_time_s"]
 
 
 def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    case = ["success", 12.0, None, None]
-    result = {"method": "ttc", "p_conservative": 0.4, "seed": 0, "cases": [case] * 3}
+    cases = Evaluation((Case("success", 12.0),) * 3)
+    result = Result("ttc", GIVEN, None, 0, (Tested(Conditions(0.4), cases),))
     (tmp_path / RESULTS).mkdir()
-    (tmp_path / RESULTS / "one.json").write_text(json.dumps(result))
+    (tmp_path / RESULTS / "one.json").write_text(json.dumps(result.to_json()))
     printed = run(capsys, "study", "report", "--out", tmp_path)
     assert [(row["method"], row["success"]) for row in printed["results"]] == [("ttc", 1.0)]
-    assert all(Path(printed[kind]).is_file() for kind in ("csv", "markdown", "figure"))
+    assert [Path(file).name for file in printed["files"]] == ["results.csv", "results.md", "results.png"]
+    assert all(Path(file).is_file() for file in printed["files"])
     assert main(["study", "report", "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert "| time to collision |" in text
-    assert all(f"wrote {printed[kind]}" in text for kind in ("csv", "markdown", "figure"))
+    assert all(f"wrote {file}" in text for file in printed["files"])
 
 
 # Bad input
@@ -249,12 +273,18 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ("traits infer --fcd DATA --model MODEL --vehicle-length 0 --out OUT.csv", "vehicle length"),
         ("policy train --method magic --out OUT", "unknown method 'magic'"),
         ("policy train --method ttc --out OUT", "hand-written rule"),
+        ("policy train --method ours --out OUT", "ours is now called vae"),
         ("policy train --method oracle --p-conservative -0.1 --out OUT", "p_conservative"),
+        ("policy train --method oracle --p-conservative 0.6 0.2 --out OUT", "from low to high"),
+        ("policy train --method oracle --p-conservative 0.1 0.2 0.3 --out OUT", "one probability or two"),
+        ("policy train --method streaming --traits MODEL --out OUT", "of a cross_window model, not of vae"),
         ("policy train --method oracle --steps 0 --out OUT", "steps"),
         ("policy train --method vae --traits nobody --out OUT", "no trait model nobody"),
         ("policy train --method vae --traits WIDE --out OUT", "3 latents where 2 are needed"),
         ("policy evaluate --model nobody", "no policy nobody"),
         ("policy evaluate --model ttc --p-conservative 2", "p_conservative"),
+        ("policy evaluate --model ttc --noise -1", "position_noise_m"),
+        ("policy evaluate --model ttc --tau 0", "tau_s"),
         ("policy evaluate --model ttc --episodes 0", "episodes"),
         ("policy evaluate --model ttc --seed -1", "seed"),
         ("study run --workers 0 --out OUT", "workers"),
@@ -341,11 +371,9 @@ def test_damaged_models(dataset: Path, trait_model: Path, tmp_path: Path, capsys
     broken = copy(trait_model.parent, tmp_path / "broken")
     (broken / "model.safetensors").write_bytes(b"nonsense")
     assert "damaged" in refuse(capsys, "traits", "evaluate", "--data", dataset, "--model", broken)
-    (tmp_path / "policy.zip").write_bytes(b"nonsense")
-    (tmp_path / "policy.json").write_text(
-        json.dumps({"method": "oracle", "p_conservative": 0.4, "settings": {"action_repeat": 1}})
-    )
-    assert "damaged" in refuse(capsys, "policy", "evaluate", "--model", tmp_path / "policy.zip")
+    run(capsys, "policy", "train", "--method", "oracle", "--steps", 1, "--out", tmp_path / "run")
+    (tmp_path / "run" / "policy.safetensors").write_bytes(b"nonsense")
+    assert "damaged" in refuse(capsys, "policy", "evaluate", "--model", tmp_path / "run")
 
 
 # Interruption
@@ -378,14 +406,15 @@ class Started:
 
 
 def test_an_interrupted_training_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    argv = ("policy", "train", "--method", "oracle", "--steps", 5_000, "--out", tmp_path / "run")
-    printed = Started(*argv).interrupt_at(r"[1-9]\d*/5000")
+    argv = ("policy", "train", "--method", "oracle", "--steps", 30_000, "--out", tmp_path / "run")
+    printed = Started(*argv).interrupt_at(r"[1-9]\d*/30000")
     assert "Traceback" not in printed
     assert "tint-sumo: interrupted" in printed
     names = {path.name for path in (tmp_path / "run").glob("[!.]*")}
-    assert names == {"run.json", "checkpoint.zip", "tensorboard"}
+    assert names >= {"run.json", "checkpoint.zip", "curve.csv", "tensorboard"}
+    assert "policy.safetensors" not in names
     run(capsys, *argv)
-    assert (tmp_path / "run" / "policy.zip").exists()
+    assert (tmp_path / "run" / "policy.safetensors").exists()
     assert not (tmp_path / "run" / "checkpoint.zip").exists()
 
 

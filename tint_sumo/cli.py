@@ -13,12 +13,14 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixe
 from tint_sumo.errors import InputError
 
 if TYPE_CHECKING:
+    from tint_sumo.config import Share
     from tint_sumo.study.report import StudyReport
 
 # What a command needs is imported when it runs: --help shall not wait for torch and SUMO.
 # ruff: noqa: PLC0415
 
 BudgetName = Literal["quick", "full", "paper"]
+ShareFlag = tuple[float, ...]  # one probability, or the two ends of a range
 PopulationName = Literal["traits", "continuous"]
 TraitBudgetName = Literal["quick", "full", "paper"]
 
@@ -72,8 +74,8 @@ class Record(Command):
     """Folder for the dataset."""
     windows: int = 30_000
     """At least so many windows of up to 20 steps of 0.1 s."""
-    p_conservative: float = 0.5
-    """Probability that a driver is conservative, 0 to 1."""
+    p_conservative: ShareFlag = (0.5,)
+    """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
     population: PopulationName = "traits"
     """traits: conservative and aggressive drivers; continuous: desired speeds and gaps without classes."""
     seed: int = 0
@@ -89,7 +91,7 @@ class Record(Command):
         manifest = record(
             self.out,
             self.windows,
-            p_conservative=self.p_conservative,
+            p_conservative=_share(self.p_conservative),
             population=self.population,
             seed=self.seed,
             workers=self.workers,
@@ -258,19 +260,22 @@ class TrainPolicy(Command):
     after_interrupt: ClassVar[str] = RESUMES
 
     method: str
-    """Learned method: no_labels, vae or oracle."""
+    """Learned method: no_labels, morton, vae, no_attention, cross_window, streaming, streaming_critic, ma or oracle."""
     out: Path
-    """Folder for the policy, its card and the TensorBoard log."""
-    p_conservative: float = 0.4
-    """Probability that a driver is conservative, 0 to 1."""
+    """Folder for the policy, its card, the training's curve and the TensorBoard log."""
+    p_conservative: ShareFlag = (0.1, 0.9)
+    """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
     steps: int | None = None
     """Decisions of the policy; those of the budget if not given."""
     seed: int = 0
     """Seed of the training, 0 to 1000."""
-    budget: BudgetName = "quick"
-    """Sizes of the network and settings of PPO."""
-    traits: str = "vae"
-    """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file."""
+    budget: BudgetName = "full"
+    """Sizes of the network, settings of PPO and number of decisions. full takes 5 to 8 minutes on a free core."""
+    traits: str | None = None
+    """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file; the
+    shipped one of the method if not given."""
+    zip: bool = False
+    """Write the policy as Stable-Baselines3's policy.zip, too. That is a pickle: others must trust you to read it."""
 
     def run(self) -> Outcome:
         from tint_sumo.study.budgets import find_budget
@@ -283,12 +288,13 @@ class TrainPolicy(Command):
         with progress_bar(f"policy {self.method}", "step") as report:
             policy = train_policy(
                 self.method,
-                self.p_conservative,
+                _share(self.p_conservative),
                 steps,
                 self.seed,
                 self.out,
                 settings=settings,
                 traits=self.traits,
+                with_zip=self.zip,
                 report=report,
             )
         content = {"model": str(policy), "method": self.method, "p_conservative": self.p_conservative}
@@ -300,13 +306,21 @@ class EvaluatePolicy(Command):
     """Evaluate a policy on unseen cases, which are the same for every policy; rates are fractions of episodes."""
 
     model: str
-    """shipped, always_go, ttc, the folder of a training run, or a policy's .zip file (only from sources you trust)."""
-    p_conservative: float | None = None
-    """Probability that a driver is conservative, 0 to 1; the one of the policy's training if not given."""
+    """A shipped policy by its method's name (streaming, oracle, ...), always_go, ttc, the folder of a training run, a
+    .safetensors file, or with --allow-pickle a .zip file."""
+    p_conservative: ShareFlag | None = None
+    """Probability that a driver is conservative, 0 to 1, or two numbers between which each case draws its own; those
+    of the policy's training if not given."""
+    noise: float = 0.0
+    """Standard deviation of the noise on the others' positions, m."""
+    tau: float = 1.0
+    """Time headway of the other drivers, s."""
     episodes: int = 500
     """Number of cases."""
     seed: int = 0
     """Which set of cases, 0 to 1000."""
+    allow_pickle: bool = False
+    """Read .zip files, which can run any code: only for files you trust."""
 
     def run(self) -> Outcome:
         from tint_sumo.study.evaluation import OUTCOMES, evaluate
@@ -314,12 +328,13 @@ class EvaluatePolicy(Command):
         from tint_sumo.study.progress import progress_bar
 
         _use_one_thread()
-        contender = load_policy(self.model)
-        p_conservative = contender.p_conservative if self.p_conservative is None else self.p_conservative
+        contender = load_policy(self.model, allow_pickle=self.allow_pickle)
+        p_conservative = contender.p_conservative if self.p_conservative is None else _share(self.p_conservative)
+        world = {"p_conservative": p_conservative, "position_noise_m": self.noise, "tau_s": self.tau}
         with progress_bar(self.model, "case") as report:
             evaluation = evaluate(
                 contender.policy,
-                lambda num_envs: contender.make_venv(num_envs, p_conservative=p_conservative),
+                lambda num_envs: contender.make_venv(num_envs, **world),
                 self.episodes,
                 self.seed,
                 report=report,
@@ -331,7 +346,7 @@ class EvaluatePolicy(Command):
         ]
         time_s = evaluation.navigation_time_s
         lines.append("no success" if time_s is None else f"navigation time {time_s:.1f} s")
-        content = {"model": self.model, "p_conservative": p_conservative, "seed": self.seed, **evaluation.summary()}
+        content = {"model": self.model, **world, "seed": self.seed, **evaluation.summary()}
         return Outcome("\n".join(lines), content)
 
 
@@ -342,7 +357,8 @@ class RunStudy(Command):
     after_interrupt: ClassVar[str] = RESUMES
 
     budget: BudgetName = "quick"
-    """quick: minutes, a small network and few steps. paper: all numbers as in the paper, days."""
+    """quick: minutes, few decisions. full: all methods with three seeds, two hours. paper: all numbers as in the paper,
+    days."""
     out: Path | None = None
     """Folder of the study; runs/<budget> if not given."""
     workers: int = 2
@@ -467,6 +483,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     if parsed.json:
         print(json.dumps(outcome.content))
     return 0
+
+
+def _share(numbers: ShareFlag) -> "Share":
+    """What one or two numbers after --p-conservative mean."""
+    if len(numbers) not in (1, 2):
+        raise InputError(f"p_conservative is one probability or two, from low to high, not {len(numbers)} numbers")
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
 
 
 def _use_one_thread() -> None:

@@ -53,13 +53,16 @@ def assert_equal(first: Any, second: Any) -> None:
         np.testing.assert_array_equal(first, second)
 
 
-def test_gymnasium_makes_it_with_no_other_import() -> None:
+@pytest.mark.parametrize("module", ["", "tint_sumo:"])
+def test_gymnasium_makes_it_by_its_id(module: str) -> None:
+    """After ``import tint_sumo``, or with the module before the id and no import, as gymnasium documents."""
     code = f"""
 import gymnasium
-env = gymnasium.make("{ENV_ID}")
+{"" if module else "import tint_sumo"}
+env = gymnasium.make("{module}{ENV_ID}")
 env.reset(seed=0)
 print(env.step(0)[1])
-vector = gymnasium.make_vec("{ENV_ID}", num_envs=64, vectorization_mode="vector_entry_point")
+vector = gymnasium.make_vec("{module}{ENV_ID}", num_envs=64, vectorization_mode="vector_entry_point")
 print(vector.reset(seed=0)[0]["vehicles"].shape)
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -68,11 +71,25 @@ print(vector.reset(seed=0)[0]["vehicles"].shape)
     assert shape == "(64, 12, 2)"
 
 
-def test_looking_for_gymnasium_before_importing_it_does_no_harm() -> None:
-    look = "import importlib.util; importlib.util.find_spec('gymnasium')"
-    code = f"{look}; import gymnasium; print(gymnasium.spec('{ENV_ID}').id)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == ENV_ID
+def test_the_first_version_is_retired_and_says_so() -> None:
+    with (
+        pytest.warns(DeprecationWarning, match="out of date"),
+        pytest.raises(gymnasium.error.DeprecatedEnv, match="Please use `tint_sumo/TIntersection-v1` instead"),
+    ):
+        gymnasium.make("tint_sumo/TIntersection-v0")
+
+
+def test_headways_are_those_asked_for() -> None:
+    """Drivers that keep a longer headway need longer for the street."""
+    shares = []
+    for tau_s in (0.5, 2.5):
+        vector = TIntersectionVectorEnv(8, tau_s=tau_s)
+        vector.reset(seed=0)
+        for _ in range(150):
+            observation, *_ = vector.step(np.zeros(8, np.int64))
+        shares.append(observation["mask"].mean())
+        vector.close()
+    assert shares[0] > 1.15 * shares[1]
 
 
 def test_gymnasiums_checker(env: TIntersectionEnv) -> None:
@@ -254,6 +271,24 @@ def test_the_stable_baselines3_adapter() -> None:
         assert info["traits"].shape == (12,)
     assert venv.get_attr("render_mode") == [None] * 4
     venv.close()
+
+
+def test_parked_environments_are_empty_until_the_next_reset() -> None:
+    venv, other = TIntersectionVecEnv(3, seed=5), TIntersectionVecEnv(3, seed=5)
+    venv.reset(), other.reset()
+    venv.env_method("park", indices=[1])
+    for _ in range(20):
+        observation, _, done, _ = venv.step(np.array([0, 0, 2]))
+        expected, *_ = other.step(np.array([0, 2, 2]))
+        assert not observation["mask"][1].any()
+        assert not done[1]
+        for key in observation:
+            np.testing.assert_array_equal(observation[key][[0, 2]], expected[key][[0, 2]])
+    assert venv.reset()["mask"].any(axis=1).all()
+    with pytest.raises(NotImplementedError, match="no methods of their own but park"):
+        venv.env_method("fly")
+    venv.close()
+    other.close()
 
 
 def test_the_adapter_seeds_like_the_vector_environment() -> None:

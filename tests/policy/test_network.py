@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from tint_sumo.config import PolicySettings
 from tint_sumo.errors import InputError
 from tint_sumo.policy.network import AttentionExtractor, GruPolicy
+from tint_sumo.policy.trait_observation import TRUE_TRAITS
 
 from .tasks import SMALL, STREET, STREET_WITH_TRAITS, box
 
@@ -207,3 +209,29 @@ def test_policy_save_and_load(tmp_path: Path) -> None:
     assert loaded.settings == SMALL and loaded.use_bfloat16
     for name, value in policy.state_dict().items():
         assert torch.equal(value, loaded.state_dict()[name])
+
+
+def test_without_attention_all_vehicles_count_the_same() -> None:
+    extractor = AttentionExtractor(STREET_WITH_TRAITS, replace(SMALL, attention=False))
+    observations = scene(6)
+    real = observations["mask"] > 0.5
+    torch.testing.assert_close(extractor.attention(observations), real / real.sum(-1, keepdim=True).clamp(min=1))
+    assert extractor.score is None
+    assert torch.isfinite(extractor(observations)).all()
+
+
+def test_only_the_critic_sees_true_traits() -> None:
+    space = spaces.Dict({**STREET_WITH_TRAITS.spaces, TRUE_TRAITS: box(12, 2)})
+    policy = make(space, settings=SMALL)
+    observations = {**scene(5), TRUE_TRAITS: torch.zeros(5, 12, 2)}
+    other = {**observations, TRUE_TRAITS: torch.ones(5, 12, 2)}
+    state, starts = policy.initial_states(5), torch.zeros(5)
+    with torch.no_grad():
+        assert not torch.allclose(
+            policy.predict_values(observations, state, starts), policy.predict_values(other, state, starts)
+        )
+        first, second = (policy.get_distribution(one, state, starts)[0] for one in (observations, other))
+        torch.testing.assert_close(first.distribution.logits, second.distribution.logits)
+    seen = {key: value.numpy() for key, value in scene(5).items()}
+    actions, _ = policy.predict(seen, deterministic=True)  # an actor in use has no true traits
+    assert actions.shape == (5,)

@@ -61,6 +61,16 @@ def test_same_seed_same_weights() -> None:
     assert not torch.equal(weights(first), weights(other))
 
 
+def test_the_entropys_weight_may_change_linearly() -> None:
+    env = Memory(4)
+    model = make(env, n_steps=8, n_epochs=1, ent_coef=LinearSchedule(0.1, 0.0, 1.0))
+    weights_seen: list[float] = []
+    update = model.train
+    model.train = lambda: (update(), weights_seen.append(model.ent_coef))  # type: ignore[method-assign, assignment, func-returns-value]
+    model.learn(4 * 8 * 4)
+    np.testing.assert_allclose(weights_seen, [0.075, 0.05, 0.025, 0.0], atol=1e-9)
+
+
 def test_save_and_load(tmp_path: Path) -> None:
     model = make(FollowTheLeader(4)).learn(64)
     model.save(tmp_path / "model")

@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from tint_sumo.config import MAX_VEHICLES, POPULATIONS, WINDOW_STEPS, Scenario, Traffic
+from tint_sumo.config import MAX_VEHICLES, POPULATIONS, WINDOW_STEPS, Scenario, Share, Traffic
 from tint_sumo.dataset.fcd import write_fcd
 from tint_sumo.dataset.schema import (
     DRIVER_SCHEMA,
@@ -63,7 +63,7 @@ class Recording:
     """What to record: at least ``windows`` windows of traffic with this share of conservative drivers."""
 
     windows: int
-    p_conservative: float = 0.5
+    p_conservative: Share = 0.5
     population: str = "traits"  # a name in POPULATIONS
     seed: int = 0
 
@@ -94,7 +94,7 @@ def record(
     out: Path,
     windows: int,
     *,
-    p_conservative: float = 0.5,
+    p_conservative: Share = 0.5,
     population: str = "traits",
     seed: int = 0,
     workers: int = 1,

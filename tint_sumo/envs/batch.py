@@ -36,6 +36,9 @@ class Batch(Protocol):
     def step(self, actions: NDArray[np.integer]) -> list[Ended]:
         """Take valid actions (N,); an episode that ends is followed by the next one at once."""
 
+    def park(self, mask: NDArray[np.bool_]) -> None:
+        """Empty the environments where the mask (N,) is true: they cost next to nothing until their next reset."""
+
     def render(self) -> list[NDArray[np.uint8]]: ...
 
     def close(self) -> None: ...
@@ -67,6 +70,10 @@ class LocalBatch:
         for one in ended:
             self._begin(one.index)
         return ended
+
+    def park(self, mask: NDArray[np.bool_]) -> None:
+        for index in np.flatnonzero(mask).tolist():
+            self.episodes.simulation.clear(index)
 
     def _ended(self, index: int) -> Ended:
         row = self.rows[index].copy()

@@ -63,8 +63,21 @@ class TIntersectionVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         raise NotImplementedError("the intersections share one simulation; give settings to the constructor")
 
-    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        raise NotImplementedError("the intersections share one simulation and have no methods of their own")
+    def env_method(
+        self,
+        method_name: str,
+        *args: Any,  # noqa: ARG002 - park takes none
+        indices: VecEnvIndices = None,
+        **kwargs: Any,  # noqa: ARG002
+    ) -> list[Any]:
+        """``"park"`` alone: empty environments, so that they cost next to nothing until the next reset of all."""
+        if method_name != "park":
+            raise NotImplementedError(
+                "the intersections share one simulation and have no methods of their own but park"
+            )
+        parked = list(self._get_indices(indices))
+        self.env.batch.park(np.isin(np.arange(self.num_envs), parked))
+        return [None for _ in parked]
 
     def env_is_wrapped(
         self,

@@ -69,6 +69,9 @@ class WorkerBatch:
             for one in answer
         ]
 
+    def park(self, mask: NDArray[np.bool_]) -> None:
+        self._ask("park", lambda share: (mask[share],))
+
     def render(self) -> list[NDArray[np.uint8]]:
         return [image for images in self._ask("render", lambda _: ()) for image in images]
 

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -79,6 +79,15 @@ def _one_hot(labels: np.ndarray) -> np.ndarray:
     return np.stack([labels > 0, labels < 0], axis=-1).astype(np.float32)
 
 
+class Encoder(Protocol):
+    """A trait model as far as windows need it."""
+
+    latent_size: int
+
+    def encode(self, states: torch.Tensor, length: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and log-variance (M, 2) of windows (M, 20, 2) of some lengths (M,)."""
+
+
 class EncoderTraits(TraitSource):
     """Traits inferred from what the ego has observed of the vehicles.
 
@@ -96,7 +105,7 @@ class EncoderTraits(TraitSource):
         InputError: the model's traits do not have 2 numbers.
     """
 
-    def __init__(self, model: TraitModel, scale: float = 1.0) -> None:
+    def __init__(self, model: Encoder, scale: float = 1.0) -> None:
         _require_latent_size(model)
         self.model = model
         self.scale = scale
@@ -208,7 +217,7 @@ class StreamingTraits(TraitSource):
 _AGE_SCALE_S = 10.0  # a vehicle crosses the street in 15 to 20 s
 
 
-def _require_latent_size(model: TraitModel) -> None:
+def _require_latent_size(model: Encoder) -> None:
     if model.latent_size != LATENT_SIZE:
         raise InputError(
             f"the policy takes traits of {LATENT_SIZE} numbers, this trait model's have {model.latent_size}; "

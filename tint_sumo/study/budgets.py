@@ -74,12 +74,12 @@ _FULL_PPO = PpoSettings(
     n_steps=64,
     n_epochs=4,
     n_minibatches=8,
-    learning_rate=1e-3,
-    gamma=0.995,  # of a decision of 0.4 s; with less, waiting for a gap does not pay
+    learning_rate=3e-3,
+    gamma=0.999,  # of a decision of 0.4 s; with less, a small risk pays more than waiting for the next gap
     ent_coef=0.01,
     final_ent_coef=0.0,  # tests take the likeliest actions: what succeeds by chance must become likely
     vf_coef=0.02,  # returns are near 8: with more, their errors drown the actor's gradient in the shared layers
-    total_steps=1_500_000,
+    total_steps=1_600_000,
     action_repeat=4,
     policy=PolicySettings(
         position_gain=6.0,
@@ -108,7 +108,7 @@ BUDGETS = {
     "quick": Budget(
         windows=30_000,
         traits=TRAIT_BUDGETS["quick"],
-        ppo=replace(_FULL_PPO, n_envs=64, learning_rate=2e-3, total_steps=200_000),
+        ppo=replace(_FULL_PPO, n_envs=64, total_steps=200_000),
         seeds=(0,),
         tests=(Test(tuple(Conditions(p) for p in P_CONSERVATIVE), 200),),
         with_shipped=True,

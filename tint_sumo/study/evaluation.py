@@ -19,6 +19,7 @@ CASES_PER_SEED = 1_000_000
 MAX_SEED = 1000
 OUTCOMES = ("success", "timeout", "collision")
 BATCH = 100  # environments at a time
+_STOP = 0  # action of environments whose case is over
 
 
 @dataclass(frozen=True)
@@ -124,10 +125,13 @@ def _first_episodes(policy: Policy, venv: VecEnv, first_seed: int, wanted: int) 
     running = np.arange(venv.num_envs) < wanted
     while running.any():
         actions, state = policy.predict(observation, state=state, episode_start=starts, deterministic=True)
-        observation, _, starts, infos = venv.step(actions)
-        for index in np.flatnonzero(starts & running).tolist():
+        observation, _, starts, infos = venv.step(np.where(running, actions, _STOP))
+        ended = np.flatnonzero(starts & running).tolist()
+        for index in ended:
             yield index, _case(infos[index])
-        running &= ~starts
+        if ended:
+            running &= ~starts
+            venv.env_method("park", indices=ended)
 
 
 def _case(info: dict[str, Any]) -> Case:

@@ -141,7 +141,9 @@ def share_training(source: Path, method: str, out: Path, traits: str | Path | No
 def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | None:
     if learned.encoder is None:
         return None
-    return trait_models.load(traits or learned.encoder, latent_size=LATENT_SIZE)
+    encoder = trait_models.load(traits or learned.encoder, latent_size=LATENT_SIZE)
+    learned.make_source(encoder)  # refuses a model of another method where it needs one of its own
+    return encoder
 
 
 def _training_venv(
@@ -237,6 +239,9 @@ class _Watch(BaseCallback):
         if time.monotonic() - self._saved_at >= CHECKPOINT_INTERVAL_S:
             self.write_checkpoint()
             self._saved_at = time.monotonic()
+        self._keep_snapshots()
+
+    def _keep_snapshots(self) -> None:
         for percent in SNAPSHOTS_PERCENT:
             stem = snapshot_stem(self._out, percent)
             if self.num_timesteps * 100 >= percent * self._steps and not card_file(stem).exists():
@@ -272,6 +277,7 @@ class _Watch(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._write_curve()
+        self._keep_snapshots()  # those that only the last rollout has reached
 
 
 def read_curve(out: Path) -> list[list[str]]:

@@ -6,8 +6,18 @@ import torch
 from gymnasium import spaces
 
 from tint_sumo.config import POSITION_SCALE_M
+from tint_sumo.dataset.schema import NO_LEADER_GAP_M
 from tint_sumo.errors import InputError
-from tint_sumo.policy.trait_observation import EncoderTraits, NoTraits, OracleTraits, TraitObservation, TraitSource
+from tint_sumo.policy.trait_observation import TRUE_TRAITS, TraitObservation
+from tint_sumo.policy.trait_sources import (
+    ClassifierTraits,
+    EncoderTraits,
+    NoTraits,
+    OracleTraits,
+    StreamingTraits,
+    TraitSource,
+)
+from tint_sumo.traits import load
 
 from .tasks import STREET, FakeVecEnv, Memory
 
@@ -261,3 +271,80 @@ def test_model_of_another_latent_size_is_refused() -> None:
 def test_other_environments_are_refused() -> None:
     with pytest.raises(InputError, match="ego, mask, vehicles"):
         TraitObservation(Memory(2), NoTraits())
+
+
+def test_streaming_is_the_posterior_of_the_track_so_far() -> None:
+    """Slot 0 appears at step 13; slot 3's vehicle is followed over more than two windows."""
+    model = load("cross_window")
+    episode = [
+        ({**scene, **({0: (-20.0 + 0.24 * k, UPPER_Y)} if k >= 13 else {})}, ego_y)
+        for k, (scene, ego_y) in enumerate(drive(60, ego_y=1.0))
+    ]
+    traits, _ = play([[episode]], StreamingTraits(model), 55)
+    for slot, start, speed_m in ((3, 0, 0.2), (0, 13, 0.24)):
+        for step in (start + 1, start + 19, start + 20, start + 21, start + 38):
+            count = step - start + 1
+            states = torch.zeros(1, count, 2)
+            states[0, :, 0] = speed_m * (torch.arange(count) % 20)  # from each window's first position
+            gap_m = np.full(count, NO_LEADER_GAP_M)
+            if slot == 0:  # follows slot 3
+                scenes = [frame[0] for frame in episode[start : step + 1]]
+                gap_m = np.array([one[3][0] - one[0][0] - 5.0 for one in scenes]).clip(max=NO_LEADER_GAP_M)
+            states[0, :, 1] = torch.from_numpy(gap_m)
+            mean, log_var = model.encode(states, torch.tensor([count]))
+            np.testing.assert_allclose(traits[step, 0, slot, :2], mean[0], atol=2e-3)
+            np.testing.assert_allclose(traits[step, 0, slot, 2:4], torch.exp(0.5 * log_var[0]), atol=2e-3)
+            assert traits[step, 0, slot, 4] == pytest.approx(count / 100)
+
+
+def test_streaming_begins_with_the_prior_and_leaves_empty_slots_zero() -> None:
+    traits, _ = play([[drive(12), drive(9)]], StreamingTraits(load("cross_window")), 14)
+    np.testing.assert_allclose(traits[0, 0, 3], [0.0, 0.0, 1.0, 1.0, 0.01])
+    np.testing.assert_allclose(traits[11, 0, 3], [0.0, 0.0, 1.0, 1.0, 0.01])  # the next episode's first step
+    np.testing.assert_allclose(traits[14, 0], traits[3, 0], atol=1e-6)  # the same drive again
+    assert (traits[:, :, [0, 1, 2, 4, 6, 7, 8, 9, 10, 11]] == 0.0).all()
+    assert (traits[2:11, 0, 3, 2:4] < 1.0).all()  # surer with each step
+
+
+def test_streaming_forgets_a_vehicle_that_has_left() -> None:
+    episode = [
+        ({slot: at for slot, at in scene.items() if slot != 3 or not 25 <= k < 27}, ego_y)
+        for k, (scene, ego_y) in enumerate(drive(50))
+    ]
+    traits, _ = play([[episode]], StreamingTraits(load("cross_window")), 30)
+    assert (traits[25:27, 0, 3] == 0.0).all()
+    np.testing.assert_allclose(traits[27, 0, 3], [0.0, 0.0, 1.0, 1.0, 0.01])
+
+
+@pytest.mark.parametrize("method", ["vae", "morton", "classifier"])
+def test_streaming_needs_posteriors(method: str) -> None:
+    with pytest.raises(InputError, match=f"of a cross_window model, not of {method}; give a model trained with"):
+        StreamingTraits(load(method))
+
+
+def test_a_classifiers_predictions_look_like_true_traits() -> None:
+    """Slot 3 drives at 2 m/s, slot 5 at 3 m/s, as an aggressive driver does; nobody is ahead of them."""
+    traits, _ = play([[drive(60)]], ClassifierTraits(load("classifier")), 25)
+    assert (traits[:20] == 0.0).all()
+    np.testing.assert_array_equal(traits[20:, 0, 3], [[1.0, 0.0]] * 6)
+    np.testing.assert_array_equal(traits[20:, 0, 5], [[0.0, 1.0]] * 6)
+
+
+def test_true_traits_beside_inferred_ones() -> None:
+    """For a critic that may see more than the actor; terminal observations hold both."""
+    env = TraitObservation(
+        TraitObservation(Script([[drive(3), drive(9)]]), StreamingTraits(load("cross_window"))),
+        OracleTraits(),
+        TRUE_TRAITS,
+    )
+    assert {key: env.observation_space[key].shape for key in ("traits", TRUE_TRAITS)} == {  # type: ignore[index]
+        "traits": (12, 5),
+        TRUE_TRAITS: (12, 2),
+    }
+    assert env.reset()[TRUE_TRAITS][0, 3].tolist() == [0.0, 1.0]
+    for _ in range(2):
+        observation, _, done, infos = env.step(np.zeros(1))
+    assert done.all()
+    assert observation[TRUE_TRAITS][0, 3].tolist() == [0.0, 1.0]  # type: ignore[call-overload]
+    assert infos[0]["terminal_observation"][TRUE_TRAITS][3].tolist() == [0.0, 1.0]
+    assert infos[0]["terminal_observation"]["traits"].shape == (12, 5)

@@ -1,14 +1,29 @@
 """The benchmark on tiny sizes: what it prints, not how fast anything is."""
 
 import json
+import sys
+from dataclasses import replace
 
 import pytest
 
-from tint_sumo.bench import Sizes, _Clocks, run_benchmark
+from tint_sumo.bench import Sizes, run_benchmark
+from tint_sumo.bench.measuring import Clocks
+from tint_sumo.bench.policies import training_speed
+from tint_sumo.study.budgets import BUDGETS
 from tint_sumo.traits import METHODS
 
+TINY_PPO = replace(BUDGETS["full"].ppo, n_envs=4, n_steps=3, n_minibatches=2)
 TINY = Sizes(
-    replicas=4, turns=2, turn_steps=3, gym_turn_steps=5, windows=20, training_windows=50, memory_env_steps=(12, 24)
+    replicas=4,
+    turns=2,
+    turn_steps=3,
+    gym_turn_steps=5,
+    windows=20,
+    training_windows=50,
+    ppo=TINY_PPO,
+    rollouts=2,
+    decisions=3,
+    memory_env_steps=(12, 24),
 )
 PARTS = {"sumo", "getters", "spawning", "claims", "safety_check", "observation", "adapter", "other"}
 
@@ -31,6 +46,10 @@ def test_the_benchmark_measures_everything() -> None:
         "memory_growth_mib",
         "train_windows_per_s",
         "encode_ms",
+        "train_decisions_per_s",
+        "recurrent_ppo_decisions_per_s",
+        "train_to_recurrent_ppo",
+        "decision_ms",
         "breakdown_us",
     }
     assert [cores["replicas"] for cores in printed["cores"]] == [4, 8]
@@ -40,6 +59,8 @@ def test_the_benchmark_measures_everything() -> None:
     assert printed["breakdown_us"].keys() == PARTS
     speeds = [printed[key] for key in printed if key.endswith("steps_per_s")]
     assert min(speeds + list(printed["breakdown_us"].values())) > 0.0
+    for key in ("train_decisions_per_s", "recurrent_ppo_decisions_per_s", "train_to_recurrent_ppo", "decision_ms"):
+        assert printed[key] > 0.0
     for part in ("train_windows_per_s", "encode_ms"):
         assert printed[part].keys() == METHODS.keys()
         assert min(printed[part].values()) > 0.0
@@ -48,6 +69,19 @@ def test_the_benchmark_measures_everything() -> None:
     table = found.table()
     assert all(part in table for part in PARTS)
     assert "clocks around the named functions" in table
+    assert "our speed to its" in table
+    assert "trait inference at every simulation step" in table
+    alone = replace(found, recurrent_ppo_decisions_per_s=None, train_to_recurrent_ppo=None).table()
+    assert "sb3-contrib is not installed: pip install sb3-contrib" in alone
+    assert "our speed to its" not in alone
+
+
+def test_training_is_measured_without_sb3_contrib(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)  # as if it were not installed
+    found = training_speed(TINY_PPO, turns=1)
+    ours = found.pop("train_decisions_per_s")
+    assert ours is not None and ours > 0.0
+    assert found == {"recurrent_ppo_decisions_per_s": None, "train_to_recurrent_ppo": None}
 
 
 class Work:
@@ -69,7 +103,7 @@ class Work:
 def test_time_in_a_watched_method_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
     work = Work()
     monkeypatch.setattr("time.perf_counter", lambda: work.now_s)
-    clocks = _Clocks()
+    clocks = Clocks()
     clocks.watch(work, "outer", "outer")
     clocks.watch(work, "inner", "inner")
     assert work.outer() == "done"

@@ -106,7 +106,7 @@ def train_policy(
             if encoder is not None:
                 save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
             card = _card(identity, encoder)
-            venv = _training_venv(learned, encoder, p_conservative, settings)
+            venv = training_venv(learned, encoder, p_conservative, settings)
             try:
                 model = _learn(venv, steps, seed, out, settings, card, report)
             finally:
@@ -146,7 +146,7 @@ def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | N
     return encoder
 
 
-def _training_venv(
+def training_venv(
     learned: Learned, encoder: TraitModel | None, p_conservative: Share, settings: PpoSettings
 ) -> VecEnv:
     """Environments with the traits that the method is trained with."""
@@ -169,7 +169,7 @@ def _learn(
 ) -> RecurrentPPO:
     """Train from the checkpoint, if there is one, to ``steps``."""
     checkpoint = out / CHECKPOINT_FILE
-    model = RecurrentPPO.load(checkpoint, env=venv) if checkpoint.exists() else _new_model(venv, seed, settings)
+    model = RecurrentPPO.load(checkpoint, env=venv) if checkpoint.exists() else new_model(venv, seed, settings)
     done = model.num_timesteps
     if done < steps:
         model.set_logger(configure(str(out / "tensorboard"), ["tensorboard"]))
@@ -186,7 +186,7 @@ def _learn(
     return model
 
 
-def _new_model(venv: VecEnv, seed: int, settings: PpoSettings) -> RecurrentPPO:
+def new_model(venv: VecEnv, seed: int, settings: PpoSettings) -> RecurrentPPO:
     return RecurrentPPO(
         "GruPolicy",
         venv,

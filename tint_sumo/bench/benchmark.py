@@ -1,4 +1,4 @@
-"""How fast environments, recorder and trait models are, measured against SUMO's own speed (``tint-sumo bench``).
+"""How fast environments, recorder, trait models and policies are, next to SUMO's own speed and sb3-contrib's.
 
 Whatever is compared is measured in turns within one run, since other work on a machine slows all of it down; what
 comes out is the median of the turns.
@@ -10,10 +10,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from multiprocessing.connection import Connection
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -23,14 +22,15 @@ import numpy as np
 import torch
 
 from tint_sumo import ENV_ID
-from tint_sumo.config import MAX_VEHICLES, WINDOW_STEPS
+from tint_sumo.bench.measuring import Clocks, Turn, one_thread, turns_apart
+from tint_sumo.bench.policies import DECISION_METHOD, INSTALL_SB3_CONTRIB, decision_ms, training_speed
+from tint_sumo.config import MAX_VEHICLES, WINDOW_STEPS, PpoSettings
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.sb3 import TIntersectionVecEnv
-from tint_sumo.processes import start_worker
 from tint_sumo.progress import make_bar
 from tint_sumo.simulation.intersections import SUMO_COLLISION_CHECK, Intersections
-from tint_sumo.study.budgets import TRAIT_BUDGETS
+from tint_sumo.study.budgets import BUDGETS, TRAIT_BUDGETS
 from tint_sumo.traits import METHODS
 from tint_sumo.traits.training import train
 
@@ -55,6 +55,9 @@ class Sizes:
     gym_turn_steps: int = 1_000  # of the single environment
     windows: int = 100_000
     training_windows: int = 40_000
+    ppo: PpoSettings = BUDGETS["full"].ppo
+    rollouts: int = 3  # of the policy's training, updates included
+    decisions: int = 1_000  # of one policy with one intersection
     memory_env_steps: tuple[int, int] = (100_000, 2_000_000)  # of single intersections: growth from, growth to
 
 
@@ -64,6 +67,9 @@ QUICK = Sizes(
     gym_turn_steps=500,
     windows=10_000,
     training_windows=5_000,
+    ppo=replace(BUDGETS["full"].ppo, n_envs=64, n_minibatches=4),  # half a rollout, minibatches as large as ever
+    rollouts=2,
+    decisions=300,
     memory_env_steps=(20_000, 100_000),
 )
 
@@ -107,6 +113,10 @@ class Benchmark:
     memory_growth_mib: float
     train_windows_per_s: dict[str, float]  # by trait method, with one thread
     encode_ms: dict[str, float]  # the same, of all 12 slots of 64 intersections
+    train_decisions_per_s: float  # PPO as in the full budget without traits, one process, one thread
+    recurrent_ppo_decisions_per_s: float | None  # the same of sb3-contrib's; None where that is not installed
+    train_to_recurrent_ppo: float | None
+    decision_ms: float  # see DECISION_METHOD
     breakdown_us: dict[str, float]  # per environment step
 
     def to_json(self) -> dict[str, Any]:
@@ -130,16 +140,28 @@ class Benchmark:
                 (f"encoding {_ENCODED} windows, {method}", f"{one_ms:.2f} ms")
                 for method, one_ms in self.encode_ms.items()
             ),
+            ("training a policy", f"{self.train_decisions_per_s:,.0f} decisions/s"),
+            *self._comparison(),
+            ("deciding with streaming traits", f"{self.decision_ms:.2f} ms"),
             ("where an environment step's time goes", f"{total_us:.1f} us"),
             *((f"  {part}", f"{us:.1f} us  {us / total_us:4.0%}") for part, us in self.breakdown_us.items()),
         ]
-        return "\n".join([*(f"{name:38} {value}" for name, value in rows), f"  ({BREAKDOWN_METHOD})"])
+        lines = [f"{name:38} {value}" for name, value in rows]
+        return "\n".join([*lines, f"  ({BREAKDOWN_METHOD})", f"  ({DECISION_METHOD})"])
+
+    def _comparison(self) -> list[tuple[str, str]]:
+        if self.recurrent_ppo_decisions_per_s is None:
+            return [("  with sb3-contrib's RecurrentPPO", INSTALL_SB3_CONTRIB)]
+        return [
+            ("  with sb3-contrib's RecurrentPPO", f"{self.recurrent_ppo_decisions_per_s:,.0f} decisions/s"),
+            ("  our speed to its", f"{self.train_to_recurrent_ppo:.2f}"),
+        ]
 
 
 def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmark:
     """Measure everything, one after the other."""
     sizes = sizes or Sizes()
-    measurements = (_speed, _breakdown, _gym_speed, _cores, _record, _memory, _traits)
+    measurements = (_speed, _breakdown, _gym_speed, _cores, _record, _memory, _traits, _policies)
     found: dict[str, Any] = {}
     with make_bar(total=len(measurements), desc="bench", unit="measurement", disable=not progress) as bar:
         for measurement in measurements:
@@ -231,7 +253,7 @@ def _checking_steps_per_s(sizes: Sizes, seed: int) -> float:
 def _breakdown(sizes: Sizes) -> dict[str, Any]:
     with _driven(sizes) as driven:
         episodes, simulation = driven.batch.episodes, driven.batch.episodes.simulation
-        clocks = _Clocks()
+        clocks = Clocks()
         simulation._connection = replace(
             simulation._connection, step=clocks.around(simulation._connection.step, "sumo")
         )
@@ -247,38 +269,6 @@ def _breakdown(sizes: Sizes) -> dict[str, Any]:
         steps = sum(driven.turn() for _ in range(sizes.turns))
     parts = ("sumo", "getters", "spawning", "claims", "safety_check", "observation", "adapter", "other")
     return {"breakdown_us": {part: clocks.spent_s[part] / steps * 1e6 for part in parts}}
-
-
-class _Clocks:
-    """Clocks around functions; what is spent in one within another one counts for the inner one alone."""
-
-    def __init__(self) -> None:
-        self.spent_s: dict[str, float] = {}
-        self._within_s = [0.0]  # spent in clocked functions, at every depth of calls
-        self._cost_s = 0.0
-        idle = self.around(lambda: None, "idle")
-        start = time.perf_counter()
-        for _ in range(1000):
-            idle()
-        self._cost_s = (time.perf_counter() - start) / 1000
-
-    def watch(self, owner: object, name: str, part: str) -> None:
-        """Put a clock around a method for good."""
-        setattr(owner, name, self.around(getattr(owner, name), part))
-
-    def around(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
-        self.spent_s.setdefault(part, 0.0)
-
-        def clocked(*args: Any, **kwargs: Any) -> Any:
-            self._within_s.append(0.0)
-            start = time.perf_counter()
-            result = function(*args, **kwargs)
-            elapsed_s = time.perf_counter() - start
-            self.spent_s[part] += elapsed_s - self._within_s.pop()
-            self._within_s[-1] += elapsed_s + self._cost_s
-            return result
-
-        return clocked
 
 
 def _gym_speed(sizes: Sizes) -> dict[str, Any]:
@@ -308,32 +298,16 @@ def _cores(sizes: Sizes) -> dict[str, Any]:
 
 def _workers_speed(sizes: Sizes) -> Cores:
     """In turns, each apart from this process."""
-    with _driven_apart(sizes, workers=1) as one, _driven_apart(sizes, workers=2) as two:
+    with turns_apart(_driven_turns, sizes, 1) as one, turns_apart(_driven_turns, sizes, 2) as two:
         speeds = [(one(), two()) for _ in range(_CORES_TURNS * sizes.turns)]
     ratio = median(b / a for a, b in speeds)
     return Cores(sizes.replicas, median(a for a, _ in speeds), median(b for _, b in speeds), ratio)
 
 
 @contextmanager
-def _driven_apart(sizes: Sizes, workers: int) -> Iterator[Callable[[], float]]:
-    """A driven environment in a process of its own; call it for the steps per second of a turn."""
-    pipe, process = start_worker(_serve_turns, sizes, workers, daemon=False)
-
-    def turn() -> float:
-        pipe.send("turn")
-        return float(pipe.recv())
-
-    try:
-        yield turn
-    finally:
-        pipe.close()
-        process.join()
-
-
-def _serve_turns(pipe: Connection, sizes: Sizes, workers: int) -> None:
-    with _driven(sizes, workers) as driven, suppress(EOFError, ConnectionError):  # nobody is at the other end
-        while pipe.recv():
-            pipe.send(driven.steps_per_s())
+def _driven_turns(sizes: Sizes, workers: int) -> Iterator[Turn]:
+    with _driven(sizes, workers) as driven:
+        yield driven.steps_per_s
 
 
 def _record(sizes: Sizes) -> dict[str, Any]:
@@ -366,14 +340,14 @@ def _memory(sizes: Sizes) -> dict[str, Any]:
 
 def _traits(sizes: Sizes) -> dict[str, Any]:
     """Each trait method with the sizes of the full budget and one thread of torch, as in the study's jobs."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_thread():
         training = {method: _train_windows_per_s(method, sizes.training_windows) for method in METHODS}
         encoding = {method: _encode_ms(method, sizes.turns) for method in METHODS}
-    finally:
-        torch.set_num_threads(threads)
     return {"train_windows_per_s": training, "encode_ms": encoding}
+
+
+def _policies(sizes: Sizes) -> dict[str, Any]:
+    return training_speed(sizes.ppo, sizes.rollouts) | {"decision_ms": decision_ms(sizes.ppo, sizes.decisions)}
 
 
 def _train_windows_per_s(method: str, windows: int) -> float:

@@ -1,0 +1,5 @@
+"""How fast all this is on the machine at hand (``tint-sumo bench``)."""
+
+from tint_sumo.bench.benchmark import QUICK, Benchmark, Sizes, run_benchmark
+
+__all__ = ["QUICK", "Benchmark", "Sizes", "run_benchmark"]

@@ -1,0 +1,82 @@
+"""What measurements of several kinds need: clocks, one thread of torch, turns in processes of their own."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from multiprocessing.connection import Connection
+from typing import Any
+
+import torch
+
+from tint_sumo.processes import start_worker
+
+Turn = Callable[[], float]  # measures once more and returns what it found
+
+
+class Clocks:
+    """Clocks around functions; what is spent in one within another one counts for the inner one alone."""
+
+    def __init__(self) -> None:
+        self.spent_s: dict[str, float] = {}
+        self._within_s = [0.0]  # spent in clocked functions, at every depth of calls
+        self._cost_s = 0.0
+        idle = self.around(lambda: None, "idle")
+        self._cost_s = min(_call_s(idle) for _ in range(10))  # whatever interrupts a clock is no cost of its own
+
+    def watch(self, owner: object, name: str, part: str) -> None:
+        """Put a clock around a method for good."""
+        setattr(owner, name, self.around(getattr(owner, name), part))
+
+    def around(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
+        self.spent_s.setdefault(part, 0.0)
+
+        def clocked(*args: Any, **kwargs: Any) -> Any:
+            self._within_s.append(0.0)
+            start = time.perf_counter()
+            result = function(*args, **kwargs)
+            elapsed_s = time.perf_counter() - start
+            self.spent_s[part] += elapsed_s - self._within_s.pop()
+            self._within_s[-1] += elapsed_s + self._cost_s
+            return result
+
+        return clocked
+
+
+def _call_s(function: Callable[[], Any], calls: int = 100) -> float:
+    start = time.perf_counter()
+    for _ in range(calls):
+        function()
+    return (time.perf_counter() - start) / calls
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread of torch, as in the study's jobs."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def turns_apart(make: Callable[..., AbstractContextManager[Turn]], *arguments: Any) -> Iterator[Turn]:
+    """The turns of ``make(*arguments)``, taken in a process of its own, which waits between them."""
+    pipe, process = start_worker(_serve_turns, make, *arguments, daemon=False)
+
+    def turn() -> float:
+        pipe.send("turn")
+        return float(pipe.recv())
+
+    try:
+        yield turn
+    finally:
+        pipe.close()
+        process.join()
+
+
+def _serve_turns(pipe: Connection, make: Callable[..., AbstractContextManager[Turn]], *arguments: Any) -> None:
+    with make(*arguments) as turn, suppress(EOFError, ConnectionError):  # nobody is at the other end
+        while pipe.recv():
+            pipe.send(turn())

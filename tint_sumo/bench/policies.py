@@ -1,0 +1,111 @@
+"""How fast policies train, next to sb3-contrib's recurrent PPO where it is installed, and how fast they decide."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from importlib.util import find_spec
+from statistics import median
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from tint_sumo import traits
+from tint_sumo.bench.measuring import Clocks, Turn, one_thread, turns_apart
+from tint_sumo.config import PpoSettings
+from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.policy import ActionRepeat, GruPolicy, StreamingTraits, TraitObservation
+from tint_sumo.study.budgets import ALL_MIXES
+from tint_sumo.study.methods import find_learned
+from tint_sumo.study.training import new_model, training_venv
+
+INSTALL_SB3_CONTRIB = "sb3-contrib is not installed: pip install sb3-contrib"
+DECISION_METHOD = (
+    "a decision: with one intersection and one thread, trait inference at every simulation step of a decision and one "
+    "call of the network, with all that wraps them; the environment's own steps do not count"
+)
+
+MakeModel = Callable[[VecEnv, int, PpoSettings], OnPolicyAlgorithm]
+
+
+def training_speed(settings: PpoSettings, turns: int) -> dict[str, float | None]:
+    """In turns, each in a process of its own: a rollout of our PPO and its updates, and the same of sb3-contrib's.
+
+    The first rollout of each, in which all episodes begin together, does not count.
+    """
+    makers: list[MakeModel] = [new_model]
+    if find_spec("sb3_contrib"):
+        makers.append(_contrib_model)
+    with ExitStack() as stack:
+        trainings = [stack.enter_context(turns_apart(_training, make, settings)) for make in makers]
+        _, *speeds = [[turn() for turn in trainings] for _ in range(1 + turns)]
+    compared = len(makers) == 2
+    return {
+        "train_decisions_per_s": median(ours for ours, *_ in speeds),
+        "recurrent_ppo_decisions_per_s": median(theirs for _, theirs in speeds) if compared else None,
+        "train_to_recurrent_ppo": median(ours / theirs for ours, theirs in speeds) if compared else None,
+    }
+
+
+@contextmanager
+def _training(make: MakeModel, settings: PpoSettings) -> Iterator[Turn]:
+    """Decisions per second of one more rollout, updates included, in a training as the study has it."""
+    venv = training_venv(find_learned("no_labels"), None, ALL_MIXES, settings)
+    with closing(venv), one_thread():
+        model = make(venv, 0, settings)
+        model.set_logger(Logger(None, []))
+        decisions = settings.n_envs * settings.n_steps
+
+        def turn() -> float:
+            start = time.perf_counter()
+            model.learn(decisions, reset_num_timesteps=False)
+            return decisions / (time.perf_counter() - start)
+
+        yield turn
+
+
+def _contrib_model(venv: VecEnv, seed: int, settings: PpoSettings) -> OnPolicyAlgorithm:
+    """Gradient steps as many and as large, LSTMs and heads as wide as ours; it has no attention, so it does less."""
+    from sb3_contrib import RecurrentPPO  # noqa: PLC0415 - optional
+
+    heads = list(settings.policy.head_sizes)
+    return RecurrentPPO(
+        "MultiInputLstmPolicy",
+        venv,
+        n_steps=settings.n_steps,
+        batch_size=settings.n_envs * settings.n_steps // settings.n_minibatches,
+        n_epochs=settings.n_epochs,
+        policy_kwargs={"lstm_hidden_size": settings.policy.hidden_size, "net_arch": {"pi": heads, "vf": heads}},
+        seed=seed,
+    )
+
+
+def decision_ms(settings: PpoSettings, decisions: int) -> float:
+    """Median time of a decision (``DECISION_METHOD``) with streaming traits and a network as large as the study's."""
+    env = TIntersectionVecEnv(1, seed=0)
+    observed = TraitObservation(env, StreamingTraits(traits.load("cross_window")))
+    with closing(ActionRepeat(observed, settings.action_repeat)) as venv, one_thread():
+        policy = GruPolicy(venv.observation_space, venv.action_space, lambda _: 0.0, settings=settings.policy)
+        clocks = Clocks()
+        clocks.watch(env, "step_wait", "environment")
+        decide = clocks.around(_driving(policy, venv), "decision")
+        spent_s = [0.0]
+        for _ in range(decisions):
+            decide()
+            spent_s.append(clocks.spent_s["decision"])
+    return 1e3 * float(np.median(np.diff(spent_s)))
+
+
+def _driving(policy: GruPolicy, venv: VecEnv) -> Callable[[], None]:
+    """Call it for one more decision."""
+    observation: Any = venv.reset()
+    state, starts = None, np.ones(venv.num_envs, bool)
+
+    def decide() -> None:
+        nonlocal observation, state, starts
+        actions, state = policy.predict(observation, state=state, episode_start=starts, deterministic=True)
+        observation, _, starts, _ = venv.step(actions)
+
+    return decide

@@ -22,7 +22,7 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import Case, Evaluation
 from tint_sumo.study.methods import METHODS, Learned
-from tint_sumo.study.results import GIVEN, RESULTS, Result, Tested
+from tint_sumo.study.results import GIVEN, RESULTS, Measured, Result
 from tint_sumo.traits.storage import save
 
 PATIENCE_S = 100.0
@@ -231,7 +231,7 @@ def test_policies_are_evaluated_in_other_worlds(capsys: pytest.CaptureFixture[st
 
 def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cases = Evaluation((Case("success", 12.0),) * 3)
-    result = Result("ttc", GIVEN, None, 0, (Tested(Conditions(0.4), cases),))
+    result = Result("ttc", GIVEN, None, 0, (Measured(Conditions(0.4), cases),))
     (tmp_path / RESULTS).mkdir()
     (tmp_path / RESULTS / "one.json").write_text(json.dumps(result.to_json()))
     printed = run(capsys, "study", "report", "--out", tmp_path)

@@ -1,30 +1,41 @@
+"""The study's plan, and a small but real study: recording, trainings and tests in worker processes, tables."""
+
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tint_sumo.config import PpoSettings, TraitSettings
 from tint_sumo.errors import InputError
-from tint_sumo.study.budgets import BUDGETS, Budget, find_budget
+from tint_sumo.study import budgets, grid, policy_jobs
+from tint_sumo.study.budgets import ALL_MIXES, BUDGETS, Budget, Conditions
+from tint_sumo.study.ceiling_job import CeilingJob
 from tint_sumo.study.grid import plan, run_study
-from tint_sumo.study.methods import METHODS, Learned, find_method
-from tint_sumo.study.policy_job import PolicyJob
+from tint_sumo.study.loading import load_policy
+from tint_sumo.study.methods import Learned, find_method
+from tint_sumo.study.policy_jobs import TrainJob
+from tint_sumo.study.results import read_results
 from tint_sumo.study.trait_job import TraitJob
+
+POLICIES = ("oracle-P0.4-seed0", "ma-P0.4-seed0")
+AT_MIX, HALF, ELSEWHERE = Conditions(0.4), Conditions(0.4, percent=50), Conditions(0.9)
 
 
 @pytest.fixture(scope="module")
-def budget() -> Budget:
-    network = TraitSettings(
-        embedding_sizes=(8, 8), hidden_size=8, encoder_output_size=8, decoder_output_size=8, batch_size=64, epochs=1
+def budget(brief: PpoSettings) -> Budget:
+    """A rule, a policy trained at one mix, and one that shares its training and learns its own traits."""
+    traits = TraitSettings(
+        embedding_sizes=(), hidden_size=8, encoder_output_size=8, decoder_output_size=8, batch_size=64, epochs=1
     )
     return Budget(
         windows=100,
-        traits=network,
-        ppo=PpoSettings(n_envs=4, n_steps=16, n_epochs=1, n_minibatches=1, total_steps=64),
-        methods=("always_go", "vae"),
-        p_conservative=(0.4,),
+        traits=traits,
+        ppo=brief,
+        methods=("always_go", "ma", "oracle"),
+        mixes=(0.4,),
         seeds=(0,),
-        episodes=4,
+        trials=(budgets.Trials((AT_MIX, HALF), 3), budgets.Trials((ELSEWHERE,), 2)),
     )
 
 
@@ -39,79 +50,135 @@ def times(out: Path) -> dict[str, int]:
     return {str(path.relative_to(out)): path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_a_study_leaves_everything_it_made(finished: Path) -> None:
     made = {str(path.relative_to(finished)) for path in finished.rglob("*")}
     assert made >= {
         "dataset/manifest.json",
-        "traits/vae/model.safetensors",
-        "traits/vae/evaluation.json",
-        "traits/vae/latent.png",
-        "policies/vae-P0.4-seed0/policy.zip",
-        "results/always_go-P0.4-seed0.json",
-        "results/vae-P0.4-seed0.json",
+        "traits/classifier/model.safetensors",
+        "traits/classifier/evaluation.json",
+        "traits/classifier/latent.png",
+        *(f"policies/{policy}/{part}.safetensors" for policy in POLICIES for part in ("policy", "policy-50")),
+        "policies/oracle-P0.4-seed0/curve.csv",
+        "results/always_go.json",
+        *(f"results/{policy}.json" for policy in POLICIES),
+        "ceilings.json",
         "results.csv",
         "results.md",
         "results.png",
+        "curves.png",
     }
-    assert not [path for path in made if path.endswith(".partial")]
-    accuracy = json.loads((finished / "traits/vae/evaluation.json").read_text())["accuracy"]
-    assert json.loads((finished / "traits/vae/model.json").read_text())["accuracy"] == accuracy
+    assert not [path for path in made if path.endswith((".partial", ".zip", ".pt", ".pkl"))]
+    accuracy = json.loads((finished / "traits/classifier/evaluation.json").read_text())["accuracy"]
+    assert json.loads((finished / "traits/classifier/model.json").read_text())["accuracy"] == accuracy
 
 
+@pytest.mark.slow
+def test_policies_are_tested_at_their_mix_alone_and_rules_everywhere(finished: Path) -> None:
+    tested = {one.method: [fared.conditions for fared in one.tested] for one in read_results(finished)}
+    assert tested == {"oracle": [AT_MIX, HALF], "ma": [AT_MIX, HALF], "always_go": [AT_MIX, ELSEWHERE]}
+    table = (finished / "results.md").read_text()
+    assert "| P 0.4" in table and "| ceiling" in table
+
+
+@pytest.mark.slow
+def test_policies_take_the_study_s_traits_and_the_training_they_share(finished: Path) -> None:
+    model = (finished / "traits" / "classifier" / "model.safetensors").read_bytes()
+    oracle, ma = (finished / "policies" / policy for policy in POLICIES)
+    assert (ma / "traits.safetensors").read_bytes() == model
+    assert (ma / "policy.safetensors").read_bytes() == (oracle / "policy.safetensors").read_bytes()
+    assert load_policy(ma).action_repeat == load_policy(oracle).action_repeat == 1
+
+
+@pytest.mark.slow
 def test_only_what_is_missing_is_made_again(budget: Budget, finished: Path) -> None:
     before = times(finished)
-    lost = finished / "results" / "always_go-P0.4-seed0.json"
+    lost = finished / "results" / "always_go.json"
     content = lost.read_text()
     lost.unlink()
     report = run_study(budget, finished, workers=1, progress=False)
     assert lost.read_text() == content
-    assert [row.method for row in report.rows] == ["always_go", "vae"]
+    assert {row.method for row in report.rows} == {"always_go", "ma", "oracle"}
     changed = {path for path, time in times(finished).items() if before.get(path) != time}
-    assert changed == {"results/always_go-P0.4-seed0.json", "results.csv", "results.md", "results.png"}
+    assert changed == {"results/always_go.json", "results.csv", "results.md", "results.png", "curves.png"}
 
 
-def test_another_budget_in_the_same_folder_is_refused(finished: Path) -> None:
+@pytest.mark.slow
+def test_another_budget_in_the_same_folder_is_refused(budget: Budget, finished: Path) -> None:
     before = times(finished)
-    with pytest.raises(InputError, match="already holds another run"):
-        run_study(BUDGETS["quick"], finished, progress=False)
+    for other in (BUDGETS["quick"], replace(budget, seeds=(1,))):
+        with pytest.raises(InputError, match="already holds another run"):
+            run_study(other, finished, progress=False)
     assert times(finished) == before
 
 
-def test_the_plan_is_the_whole_grid(tmp_path: Path) -> None:
-    budget = BUDGETS["paper"]
-    jobs = plan(budget, tmp_path)
-    grid = {(job.method, job.p_conservative, job.seed) for job in jobs if isinstance(job, PolicyJob)}
-    assert len(grid) == len(budget.methods) * 3 * 3
-    assert [job.name for job in jobs if isinstance(job, TraitJob)] == ["traits vae"]
-    assert len({job.name for job in jobs}) == len(jobs)
-    names = {job.name for job in jobs}
-    assert all(set(job.needs) <= names for job in jobs)
-    encoders = {job.method for job in jobs if isinstance(job, PolicyJob) and job.needs}
-    assert encoders == {"vae"}
+# The plan
 
 
 @pytest.mark.parametrize("name", BUDGETS)
-def test_budgets(name: str) -> None:
-    budget = find_budget(name)
-    assert budget.methods == tuple(METHODS)
-    assert all(find_method(method) for method in budget.methods)
-    assert any(isinstance(find_method(method), Learned) for method in budget.methods)
-    assert budget.ppo.n_minibatches <= budget.ppo.n_envs
+def test_the_plan_is_the_whole_grid(tmp_path: Path, name: str) -> None:
+    budget = replace(BUDGETS[name], with_shipped=False)
+    jobs = plan(budget, tmp_path)
+    learned = {method for method in budget.methods if isinstance(find_method(method), Learned)}
+    grid_of_policies = {(method, mix, seed) for method in learned for mix in budget.mixes for seed in budget.seeds}
+    trained = [(job.method, job.mix, job.seed) for job in jobs if isinstance(job, TrainJob)]
+    tested = [(job.method, job.mix, job.seed) for job in jobs if isinstance(job, policy_jobs.EvaluateJob)]
+    assert len(trained) == len(grid_of_policies) and set(trained) == grid_of_policies
+    assert set(tested) == grid_of_policies | {(method, None, 0) for method in budget.methods if method not in learned}
+    assert sum(isinstance(job, CeilingJob) for job in jobs) == 1
+    assert len({job.name for job in jobs}) == len(jobs)
 
 
-def test_the_paper_s_budget() -> None:
-    paper = BUDGETS["paper"]
-    assert paper.ppo == PpoSettings()
-    assert paper.traits == TraitSettings()
-    assert (paper.p_conservative, len(paper.seeds), paper.episodes) == ((0.25, 0.4, 0.6), 3, 500)
+@pytest.mark.parametrize("name", BUDGETS)
+def test_what_a_job_needs_comes_before_it(tmp_path: Path, name: str) -> None:
+    seen: set[str] = set()
+    for job in plan(BUDGETS[name], tmp_path):
+        assert set(job.needs) <= seen, f"{job.name} would wait for what comes later"
+        seen.add(job.name)
 
 
-def test_unknown_budget() -> None:
-    with pytest.raises(InputError, match="unknown budget 'huge'; choose one of: quick, paper"):
-        find_budget("huge")
+def test_one_seed_is_finished_before_the_next_is_begun(tmp_path: Path) -> None:
+    jobs = plan(BUDGETS["full"], tmp_path)
+    seeds = [job.seed for job in jobs if isinstance(job, TrainJob | policy_jobs.EvaluateJob) and job.mix is not None]
+    assert seeds == sorted(seeds)
 
 
-def test_at_least_one_worker(budget: Budget, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="workers"):
+def test_traits_are_learnt_first_where_the_budget_learns_them_and_nowhere_else(tmp_path: Path, budget: Budget) -> None:
+    jobs = plan(budget, tmp_path)
+    assert [job.name for job in jobs if isinstance(job, TraitJob)] == ["traits classifier"] == [jobs[0].name]
+    every = plan(replace(budget, methods=("vae", "no_attention", "streaming", "oracle", "ma")), tmp_path)
+    assert [job.method for job in every if isinstance(job, TraitJob)] == ["vae", "cross_window", "classifier"]
+    given = plan(replace(budget, traits=None), tmp_path)
+    assert not [job for job in given if isinstance(job, TraitJob)]
+    assert not [need for job in given for need in job.needs if need.startswith("traits")]
+
+
+def test_ma_needs_the_oracle_s_training_with_the_same_seed_and_mix(tmp_path: Path, budget: Budget) -> None:
+    jobs = plan(replace(budget, mixes=(0.4, ALL_MIXES), seeds=(0, 1)), tmp_path)
+    needs = {job.name: job.needs for job in jobs if isinstance(job, TrainJob) and job.method == "ma"}
+    assert needs == {
+        f"train ma-{which}": ("traits classifier", f"train oracle-{which}")
+        for which in ("P0.4-seed0", "P0.1to0.9-seed0", "P0.4-seed1", "P0.1to0.9-seed1")
+    }
+
+
+def test_shipped_policies_are_tested_where_the_budget_says_so(
+    tmp_path: Path, budget: Budget, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(grid, "shipped_policies", lambda: ["vae", "oracle"])
+
+    def given(with_shipped: bool) -> list[str]:
+        jobs = plan(replace(budget, with_shipped=with_shipped), tmp_path)
+        return [job.name for job in jobs if isinstance(job, policy_jobs.EvaluateJob) and job.mix is None]
+
+    assert given(False) == ["evaluate always_go"]
+    assert given(True) == ["evaluate always_go", "evaluate vae-shipped", "evaluate oracle-shipped"]
+
+
+def test_unknown_methods_and_too_few_workers_leave_no_folder(budget: Budget, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="workers must be at least 1"):
         run_study(budget, tmp_path / "study", workers=0)
+    for name in ("magic", "ours"):
+        with pytest.raises(InputError, match=f"{name}"):
+            run_study(replace(budget, methods=(name,)), tmp_path / "study")
     assert not (tmp_path / "study").exists()

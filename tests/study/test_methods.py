@@ -1,35 +1,75 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
-import torch
 
-from tint_sumo.errors import InputError
-from tint_sumo.policy import EncoderTraits, NoTraits, OracleTraits
+from tint_sumo import traits
+from tint_sumo.config import LATENT_SIZE, TraitSettings
+from tint_sumo.errors import RENAMED_METHODS, InputError
+from tint_sumo.policy import ClassifierTraits, EncoderTraits, NoTraits, OracleTraits, StreamingTraits
+from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import METHODS, Learned, Rule, find_learned, find_method, register
 from tint_sumo.study.rules import AlwaysGo
+from tint_sumo.traits import TraitModel
+
+LEARNED = [name for name, method in METHODS.items() if isinstance(method, Learned)]
+SMALL = TraitSettings(embedding_sizes=(), hidden_size=4, encoder_output_size=4, decoder_output_size=4)
 
 
-class Constant:
-    """A trait model that says 1, 2 whatever it sees."""
-
-    latent_size = 2
-
-    def encode(self, states: torch.Tensor, length: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        mean = torch.tensor([1.0, 2.0]).expand(len(length), 2)
-        return mean, torch.zeros_like(mean)
+def some_encoder(method: Learned) -> TraitModel | None:
+    """A trait model as the method needs it, which nobody trained."""
+    return None if method.encoder is None else traits.METHODS[method.encoder](SMALL)
 
 
-def test_the_methods_of_the_study() -> None:
-    assert list(METHODS) == ["always_go", "ttc", "no_labels", "vae", "oracle"]
-    assert {name for name, method in METHODS.items() if isinstance(method, Rule)} == {"always_go", "ttc"}
+def test_rules_come_first_and_the_oracle_last() -> None:
+    assert list(METHODS)[:3] == ["always_go", "ttc", "no_labels"]
+    assert list(METHODS)[-1] == "oracle"
+    assert set(METHODS) - set(LEARNED) == {"always_go", "ttc"}
 
 
-def test_trait_sources() -> None:
-    sources = {
-        name: type(method.source(Constant() if method.encoder else None))
-        for name, method in METHODS.items()
-        if isinstance(method, Learned)
-    }
-    assert sources == {"no_labels": NoTraits, "vae": EncoderTraits, "oracle": OracleTraits}
+def test_names_and_titles_belong_to_one_method_each() -> None:
+    assert [method.name for method in METHODS.values()] == list(METHODS)
+    assert len({method.title for method in METHODS.values()}) == len(METHODS)
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_encoders_are_trait_methods_and_shared_trainings_are_methods_that_are_trained(name: str) -> None:
+    method = find_learned(name)
+    assert method.encoder in (None, *traits.METHODS)
+    if method.trained_as is not None:
+        other = find_learned(method.trained_as)
+        assert other.trained_as is None
+        assert other.attention == method.attention
+        assert other.make_source(some_encoder(other)).size == method.make_source(some_encoder(method)).size
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("no_labels", NoTraits),
+        ("morton", EncoderTraits),
+        ("vae", EncoderTraits),
+        ("no_attention", EncoderTraits),
+        ("cross_window", EncoderTraits),
+        ("streaming", StreamingTraits),
+        ("streaming_critic", StreamingTraits),
+        ("ma", ClassifierTraits),
+        ("oracle", OracleTraits),
+    ],
+)
+def test_each_method_gets_its_traits_from_its_own_source(name: str, kind: type) -> None:
+    method = find_learned(name)
+    encoder = some_encoder(method)
+    source, another = method.make_source(encoder), method.make_source(encoder)
+    assert type(source) is kind
+    assert source is not another
+    assert source.size == (5 if kind is StreamingTraits else LATENT_SIZE)
+
+
+def test_ablations_differ_from_their_methods_in_one_thing() -> None:
+    assert not find_learned("no_attention").attention
+    assert [name for name in LEARNED if not find_learned(name).attention] == ["no_attention"]
+    assert [name for name in LEARNED if find_learned(name).critic_sees_true_traits] == ["streaming_critic"]
 
 
 def test_rules_act() -> None:
@@ -40,18 +80,42 @@ def test_rules_act() -> None:
             assert actions.shape == (3,)
 
 
-def test_a_name_is_taken_once() -> None:
+@pytest.mark.parametrize("twin", [Rule("ttc", "another", AlwaysGo), Learned("ttc", "another", NoTraits)])
+def test_a_name_is_taken_once(twin: Rule | Learned) -> None:
     with pytest.raises(ValueError, match="two methods are called 'ttc'"):
-        register(Rule("ttc", "another", AlwaysGo))
+        register(twin)
     assert METHODS["ttc"].title == "time to collision"
 
 
-def test_unknown_methods_are_refused_with_the_known_ones() -> None:
-    with pytest.raises(InputError, match="unknown method 'magic'; choose one of: always_go, ttc, no_labels, vae"):
+def test_a_new_method_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tint_sumo.study.methods.METHODS", dict(METHODS))
+    new = register(Learned("guess", "a guess", NoTraits))
+    assert find_method("guess") is find_learned("guess") is new
+    assert "guess" not in METHODS
+
+
+def test_unknown_methods_are_answered_with_the_known_ones() -> None:
+    with pytest.raises(InputError, match="unknown method 'magic'; choose one of: always_go, ttc, no_labels, morton"):
         find_method("magic")
 
 
+@pytest.mark.parametrize(("old", "new"), RENAMED_METHODS.items())
+def test_names_of_the_past_are_answered_with_those_of_today(old: str, new: str) -> None:
+    assert new in METHODS
+    for find in (find_method, find_learned, load_policy):
+        with pytest.raises(InputError, match=f"^{old} is now called {new}; use that name$"):
+            find(old)
+
+
+def test_a_folder_with_a_name_of_the_past_is_still_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ours").mkdir()
+    (tmp_path / "ours" / "policy.safetensors").write_bytes(b"")
+    with pytest.raises(InputError, match=r"no file ours/policy\.json"):
+        load_policy("ours")
+
+
 def test_rules_are_not_trained() -> None:
-    with pytest.raises(InputError, match=r"hand-written rule.*choose one of: no_labels, vae, oracle"):
+    with pytest.raises(InputError, match=r"hand-written rule and needs no training; choose one of: no_labels, morton"):
         find_learned("ttc")
     assert find_learned("vae").encoder == "vae"

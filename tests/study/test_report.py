@@ -1,83 +1,238 @@
 import csv
-import json
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
-from tests.study.scenes import result
-from tint_sumo.files import write_json
-from tint_sumo.study.report import tabulate, to_csv, to_markdown, write_report
-from tint_sumo.study.results import RESULTS
-from tint_sumo.study.statistics import wilson_interval
+from tests.study.scenes import given, trained, write_results
+from tint_sumo.errors import InputError
+from tint_sumo.files import write_json, write_text
+from tint_sumo.study.budgets import ALL_MIXES, Conditions
+from tint_sumo.study.ceiling_job import CEILINGS_FILE
+from tint_sumo.study.report import StudyReport, to_csv, to_markdown, write_report
+from tint_sumo.study.results import Result
+from tint_sumo.study.rows import Row, tabulate
+from tint_sumo.study.statistics import Rate, difference_interval, rate_interval
+from tint_sumo.study.training import CURVE_FILE
 
-RESULTS_OF_A_STUDY = [
-    result("oracle", 0.4, 1, 8, 1, 1),
-    result("ttc", 0.25, 0, 5, 4, 1),
-    result("oracle", 0.4, 0, 9, 1, 0),
-    result("always_go", 0.4, 0, 0, 0, 10),
+WORLD, NOISY, HALF = Conditions(ALL_MIXES), Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, percent=50)
+CURVE = "decisions,success,timeout,collision\n64,0.1,0.4,0.5\n128,0.6,0.1,0.3\n"
+CEILINGS = {"0.25": 0.875, "0.4": 1.0}
+OUTCOMES = ("success", "timeout", "collision")
+
+
+def policy(method: str, seed: int, success: int) -> Result:
+    """A policy with so many successes of 20 cases among P 0.4, and fewer elsewhere."""
+    timeout, collision = 1, 19 - success
+    tested = {
+        Conditions(0.25): (success - 2, timeout, collision + 2),
+        Conditions(0.4): (success, timeout, collision),
+        WORLD: (success - 1, timeout, collision + 1),
+        NOISY: (success - 3, timeout, collision + 3),
+        HALF: (success - 4, timeout, collision + 4),
+    }
+    return trained(method, seed, tested)
+
+
+SEVERAL_SEEDS = [
+    *(policy("oracle", seed, success) for seed, success in enumerate((19, 18, 19))),
+    *(policy("no_labels", seed, success) for seed, success in enumerate((8, 7, 6))),
+    *(policy("vae", seed, success) for seed, success in enumerate((15, 12, 14))),
+    given("always_go", {Conditions(0.4): (0, 0, 20), WORLD: (0, 0, 20)}),
 ]
+ONE_SEED = [policy("oracle", 0, 18), given("ttc", {Conditions(0.25): (5, 4, 1), Conditions(0.6): (9, 1, 0)})]
 
 
-@pytest.fixture
-def study(tmp_path: Path) -> Path:
-    for number, one in enumerate(RESULTS_OF_A_STUDY):
-        write_json(tmp_path / RESULTS / f"{number}.json", one.to_json())
-    return tmp_path
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All that a study leaves for its report."""
+    out = write_results(SEVERAL_SEEDS, tmp_path_factory.mktemp("study"))
+    write_json(out / CEILINGS_FILE, CEILINGS)
+    for name in ("oracle-P0.1to0.9-seed0", "oracle-P0.1to0.9-seed1", "no_labels-P0.1to0.9-seed0"):
+        write_text(out / "policies" / name / CURVE_FILE, CURVE)
+    return out
 
 
-def test_rows_pool_seeds_and_keep_the_order_of_the_registry() -> None:
-    rows = tabulate(RESULTS_OF_A_STUDY)
-    assert [(row.p_conservative, row.method, row.seeds) for row in rows] == [
-        (0.25, "ttc", (0,)),
-        (0.4, "always_go", (0,)),
-        (0.4, "oracle", (0, 1)),
-    ]
-    pooled = rows[2].evaluation.rate("success")
-    assert (pooled.count, pooled.total) == (17, 20)
+@pytest.fixture(scope="module")
+def report(study: Path) -> StudyReport:
+    return write_report(study)
 
 
-def test_the_paper_s_numbers_stand_beside_where_there_are_any() -> None:
-    published = {(row.method, row.p_conservative): row.published for row in tabulate(RESULTS_OF_A_STUDY)}
-    assert published[("oracle", 0.4)] == {"success": 90, "timeout": 4, "collision": 5}
-    assert published[("ttc", 0.25)] == {}
+def row_at(report: StudyReport, method: str, p_conservative: float) -> Row:
+    return next(row for row in report.rows if (row.method, row.conditions) == (method, Conditions(p_conservative)))
 
 
-def test_csv() -> None:
-    ttc, always_go, oracle = csv.DictReader(to_csv(tabulate(RESULTS_OF_A_STUDY)).splitlines())
-    low, high = wilson_interval(17, 20)
-    assert float(oracle["success_percent"]) == 85.0
-    assert float(oracle["success_low_percent"]) == pytest.approx(100 * low, abs=0.005)
-    assert float(oracle["success_high_percent"]) == pytest.approx(100 * high, abs=0.005)
-    assert float(oracle["navigation_time_s"]) == pytest.approx((sum(range(9)) + sum(range(8))) / 17 + 10, abs=0.005)
-    assert (oracle["episodes"], oracle["seeds"], oracle["paper_success_percent"]) == ("20", "0 1", "90")
-    assert (always_go["navigation_time_s"], always_go["collision_percent"]) == ("", "100.00")
-    assert (ttc["p_conservative"], ttc["paper_success_percent"]) == ("0.25", "")
+def tables(markdown: str) -> dict[str, list[list[str]]]:
+    """Cells of each table by its heading; every table must be rectangular, in plain text, too."""
+    found = {}
+    for part in markdown.split("## ")[1:]:
+        heading, table, note = part.strip().split("\n\n")
+        lines = table.splitlines()
+        assert len({len(line) for line in lines}) == 1
+        assert len({line.count("|") for line in lines}) == 1
+        assert set(lines[1]) == set("| -")
+        assert note.endswith(".")
+        found[heading] = [[cell.strip() for cell in line.strip("|").split("|")] for line in (lines[0], *lines[2:])]
+    return found
 
 
-def test_markdown_is_a_table() -> None:
-    table, note = to_markdown(tabulate(RESULTS_OF_A_STUDY)).split("\n\n")
-    lines = table.splitlines()
-    assert len(lines) == 5
-    assert len({len(line) for line in lines}) == 1
-    assert len({line.count("|") for line in lines}) == 1
-    assert "85.0 [64.0, 94.8]" in lines[4]
-    assert "90 / 4 / 5" in lines[4]
-    assert "Wilson" in note
-
-
-def test_all_three_files_are_written(study: Path) -> None:
-    report = write_report(study)
-    assert report.csv_file.read_text().startswith("method,p_conservative,success_percent")
+def test_every_file_is_written_and_nothing_else(study: Path, report: StudyReport) -> None:
     assert report.markdown_file.read_text() == report.markdown
-    with Image.open(report.figure_file) as figure:
-        assert figure.format == "PNG"
-        assert figure.width > 500
-    assert not list(study.rglob("*.partial"))
+    assert [file.name for file in report.figure_files] == ["results.png", "worlds.png", "curves.png"]
+    for file in report.figure_files:
+        with Image.open(file) as figure:
+            assert figure.format == "PNG" and figure.width > 500
+    written = {report.csv_file, report.markdown_file, *report.figure_files}
+    assert {path for path in study.rglob("*") if path.is_file() and path.suffix != ".json"} == {
+        *written,
+        *study.glob(f"policies/*/{CURVE_FILE}"),
+    }
+    assert report.rows == tuple(tabulate(SEVERAL_SEEDS))
 
 
-def test_rows_are_ready_for_json(study: Path) -> None:
-    row = json.loads(json.dumps(write_report(study).rows[2].to_json()))
-    assert row["method"] == "oracle"
-    assert row["success"] == 0.85
-    assert row["published_percent"]["success"] == 90
+def test_the_csv_file_has_a_line_for_every_row_and_the_documented_columns(report: StudyReport) -> None:
+    with report.csv_file.open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    world = ["p_conservative", "position_noise_m", "tau_s", "training_percent"]
+    closing = ["navigation_time_s", "episodes", "seeds", "ceiling_percent"]
+    measured = [f"{outcome}{part}_percent" for outcome in OUTCOMES for part in ("", "_low", "_high", "_sd")]
+    paper = [f"paper_{outcome}_percent" for outcome in OUTCOMES]
+    assert list(lines[0]) == ["method", "origin", *world, *measured, *closing, *paper]
+    assert [line["method"] for line in lines] == [row.method for row in report.rows]
+    assert not any(None in line or None in line.values() for line in lines)
+
+
+def test_csv_values_of_several_seeds(report: StudyReport) -> None:
+    row = row_at(report, "oracle", 0.4)
+    line = list(csv.DictReader(to_csv(report.rows, {0.4: 1.0}).splitlines()))[report.rows.index(row)]
+    low, high = rate_interval(row.hits("success"))
+    assert float(line["success_percent"]) == pytest.approx(100 * 56 / 60, abs=0.005)
+    assert float(line["success_low_percent"]) == pytest.approx(100 * low, abs=0.005)
+    assert float(line["success_high_percent"]) == pytest.approx(100 * high, abs=0.005)
+    assert float(line["success_sd_percent"]) == pytest.approx(5 / 3**0.5, abs=0.005)
+    assert float(line["timeout_percent"]) == 5.0
+    assert float(line["navigation_time_s"]) == pytest.approx(10 + (2 * sum(range(19)) + sum(range(18))) / 56, abs=0.005)
+    assert (line["origin"], line["p_conservative"]) == ("trained", "0.4")
+    assert (line["episodes"], line["seeds"], line["ceiling_percent"]) == ("20", "0 1 2", "100.00")
+    assert [line[f"paper_{outcome}_percent"] for outcome in OUTCOMES] == ["90", "4", "5"]
+
+
+def test_csv_values_of_one_seed() -> None:
+    lines = list(csv.DictReader(to_csv(tabulate(ONE_SEED), {}).splitlines()))
+    by_place = {(line["method"], line["p_conservative"], line["training_percent"]): line for line in lines}
+    ttc, half = by_place["ttc", "0.25", "100"], by_place["oracle", "0.1 to 0.9", "50"]
+    low, high = Rate(5, 10).interval
+    assert (float(ttc["success_low_percent"]), float(ttc["success_high_percent"])) == pytest.approx(
+        (100 * low, 100 * high), abs=0.005
+    )
+    assert (ttc["success_sd_percent"], ttc["ceiling_percent"], ttc["paper_success_percent"]) == ("", "", "")
+    assert (half["position_noise_m"], half["tau_s"], half["success_percent"]) == ("0", "1", "70.00")
+
+
+def test_every_table_of_several_seeds_is_there(report: StudyReport) -> None:
+    assert list(tables(report.markdown)) == [
+        "Success by mix of drivers",
+        "All outcomes",
+        "Who is hit",
+        "Differences in success",
+        "Other worlds and shorter trainings",
+    ]
+
+
+def test_the_success_table_has_the_spread_the_ceiling_and_the_paper(report: StudyReport) -> None:
+    assert tables(report.markdown)["Success by mix of drivers"] == [
+        ["method", "seeds", "P 0.25", "P 0.4"],
+        ["always go", "1", "-", "0.0"],
+        ["no labels", "3", "25.0 ± 5.0", "35.0 ± 5.0"],
+        ["paper's method", "3", "58.3 ± 7.6", "68.3 ± 7.6"],
+        ["oracle", "3", "83.3 ± 2.9", "93.3 ± 2.9"],
+        ["ceiling", "", "87.5", "100.0"],
+        ["paper", "", "81", "91"],
+    ]
+
+
+def test_the_outcome_table_has_intervals_and_the_paper_s_outcomes(report: StudyReport) -> None:
+    header, *lines = tables(report.markdown)["All outcomes"]
+    assert header == ["P", "method", "success %", "timeout %", "collision %", "time s", "cases", "seeds", "paper %"]
+    assert len(lines) == 7
+    oracle = next(line for line in lines if line[:2] == ["0.4", "oracle"])
+    low, high = row_at(report, "oracle", 0.4).intervals["success"]
+    assert oracle[2] == f"93.3 [{100 * low:.1f}, {100 * high:.1f}]"
+    assert oracle[6:] == ["20", "0, 1, 2", "90 / 4 / 5"]
+    always_go = next(line for line in lines if line[1] == "always go")
+    assert (always_go[5], always_go[8]) == ("-", "-")
+    assert always_go[2].startswith("0.0 [0.0, ")
+
+
+def test_collisions_are_counted_in_a_thousand_cases(report: StudyReport) -> None:
+    table = tables(report.markdown)["Who is hit"]
+    assert table[0] == ["method", "aggressive, lower lane"]
+    assert table[1] == ["always go", "1000.0"]
+    assert table[-1] == ["oracle", f"{1000 * (1 + 1 + 6) / 120:.1f}"]
+
+
+def test_differences_are_to_the_oracle_and_to_no_labels_with_intervals(report: StudyReport) -> None:
+    header, *lines = tables(report.markdown)["Differences in success"]
+    assert header == ["method", "less", "P 0.25", "P 0.4"]
+    assert [line[:2] for line in lines] == [
+        ["no labels", "oracle"],
+        ["paper's method", "oracle"],
+        ["paper's method", "no labels"],
+        ["oracle", "no labels"],
+    ]
+    vae, oracle = (row_at(report, name, 0.4) for name in ("vae", "oracle"))
+    low, high = difference_interval(vae.hits("success"), oracle.hits("success"))
+    assert lines[1][3] == f"-25.0 [{100 * low:+.1f}, {100 * high:+.1f}]"
+    assert lines[3][3].startswith("+58.3 [+")
+
+
+def test_methods_that_did_not_meet_the_same_cases_are_not_compared() -> None:
+    fewer = [trained("vae", seed, {Conditions(0.4): (4, 0, 1)}) for seed in range(2)]
+    rows = tabulate([*SEVERAL_SEEDS[:3], *fewer])
+    (line,) = tables(to_markdown(rows, {}))["Differences in success"][1:]
+    assert line == ["paper's method", "oracle", "-", "-"]
+
+
+def test_other_worlds_stand_beside_the_training_s(report: StudyReport) -> None:
+    assert tables(report.markdown)["Other worlds and shorter trainings"] == [
+        ["method", "as trained", "noise 0.1 m", "50 % of training"],
+        ["always go", "0.0 (100.0)", "-", "-"],
+        ["no labels", "30.0 (65.0)", "20.0 (75.0)", "15.0 (80.0)"],
+        ["paper's method", "63.3 (31.7)", "53.3 (41.7)", "48.3 (46.7)"],
+        ["oracle", "88.3 (6.7)", "78.3 (16.7)", "73.3 (21.7)"],
+    ]
+
+
+def test_a_study_with_one_seed_and_no_curves_has_no_differences(tmp_path: Path) -> None:
+    report = write_report(write_results(ONE_SEED, tmp_path))
+    assert [file.name for file in report.figure_files] == ["results.png", "worlds.png"]
+    found = tables(report.markdown)
+    assert "Differences in success" not in found
+    assert found["Success by mix of drivers"] == [
+        ["method", "seeds", "P 0.25", "P 0.4", "P 0.6"],
+        ["time to collision", "1", "50.0", "-", "90.0"],
+        ["oracle", "1", "80.0", "90.0", "-"],
+    ]
+
+
+def test_a_study_of_a_single_world_has_one_figure(tmp_path: Path) -> None:
+    report = write_report(write_results([given("ttc", {WORLD: (2, 1, 1)})], tmp_path))
+    assert [file.name for file in report.figure_files] == ["worlds.png"]
+    assert list(tables(report.markdown)) == ["Other worlds and shorter trainings"]
+
+
+def test_a_training_without_an_episode_yet_has_no_curve(tmp_path: Path) -> None:
+    write_results(ONE_SEED, tmp_path)
+    write_text(tmp_path / "policies" / "oracle-P0.1to0.9-seed0" / CURVE_FILE, CURVE.splitlines()[0] + "\n")
+    assert [file.name for file in write_report(tmp_path).figure_files] == ["results.png", "worlds.png"]
+
+
+@pytest.mark.parametrize("file", [CEILINGS_FILE, f"policies/oracle-P0.1to0.9-seed0/{CURVE_FILE}"])
+@pytest.mark.parametrize("text", ["", "[1, 2]", '{"P": 1}', '{"0.4": "high"}', "decisions\n64"])
+def test_damaged_files_are_named_in_one_line(tmp_path: Path, file: str, text: str) -> None:
+    write_results(ONE_SEED, tmp_path)
+    write_text(tmp_path / file, text)
+    with pytest.raises(InputError, match=rf"{Path(file).name} is damaged") as refusal:
+        write_report(tmp_path)
+    assert "\n" not in str(refusal.value)
+    assert not (tmp_path / "results.csv").exists()

@@ -1,25 +1,50 @@
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.study.scenes import result
+from tests.study.scenes import given, trained, write_results
+from tint_sumo.config import Idm
 from tint_sumo.errors import InputError
-from tint_sumo.files import write_json
+from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.report import write_report
-from tint_sumo.study.results import RESULTS, read_results
+from tint_sumo.study.results import RESULTS, Result, read_results
 
-SOME_RESULTS = [result("oracle", 0.4, 1, 8, 1, 1), result("ttc", 0.25, 0, 0, 0, 3)]
+SOME_RESULTS = [
+    trained("oracle", 1, {Conditions(0.4): (8, 1, 1), Conditions(ALL_MIXES, 0.05, 0.7, 25): (3, 0, 2)}),
+    trained("vae", 0, {Conditions(0.25): (1, 0, 0)}, mix=0.25),
+    given("ttc", {Conditions(0.25): (0, 0, 3)}),
+]
 
 
 @pytest.fixture
 def study(tmp_path: Path) -> Path:
-    for number, one in enumerate(SOME_RESULTS):
-        write_json(tmp_path / RESULTS / f"{number}.json", one.to_json())
-    return tmp_path
+    return write_results(SOME_RESULTS, tmp_path)
 
 
 def test_files_give_back_the_results(study: Path) -> None:
     assert read_results(study) == SOME_RESULTS
+
+
+def test_a_file_says_how_the_policy_fared_without_a_look_at_the_cases(study: Path) -> None:
+    content = json.loads((study / RESULTS / "0.json").read_text())
+    assert (content["method"], content["origin"], content["mix"], content["seed"]) == (
+        "oracle",
+        "trained",
+        [0.1, 0.9],
+        1,
+    )
+    first, second = content["tested"]
+    assert (first["p_conservative"], first["position_noise_m"], first["tau_s"]) == (0.4, 0.0, Idm.tau_s)
+    assert (first["success"], first["timeout"], first["collision"], first["percent"]) == (0.8, 0.1, 0.1, 100)
+    assert (second["p_conservative"], second["position_noise_m"], second["tau_s"]) == ([0.1, 0.9], 0.05, 0.7)
+    assert (second["success"], second["percent"]) == (0.6, 25)
+
+
+def test_a_policy_that_no_test_is_for_has_no_cases(tmp_path: Path) -> None:
+    untested = trained("oracle", 0, {}, mix=0.25)
+    assert read_results(write_results([untested], tmp_path)) == [untested]
 
 
 def test_no_results(tmp_path: Path) -> None:
@@ -28,19 +53,51 @@ def test_no_results(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "\0", '{"method": "ttc", "p_conservative": 0.4, "cases": []}'])
+def test_files_that_are_no_results_are_named(study: Path, text: str) -> None:
+    damage(study, text)
+
+
+@pytest.mark.parametrize("entry", ["method", "origin", "mix", "seed", "tested"])
+def test_results_with_a_part_missing_are_named(study: Path, entry: str) -> None:
+    content = SOME_RESULTS[0].to_json()
+    del content[entry]
+    damage(study, json.dumps(content))
+
+
 @pytest.mark.parametrize(
-    "damage",
+    "change",
     [
-        "{",
-        "[]",
-        "{}",
-        '{"method": "ttc", "p_conservative": 0.4, "seed": 0, "cases": []}',
-        '{"method": "ttc", "p_conservative": 0.4, "seed": 0, "cases": [["flew", 1.0]]}',
-        '{"method": "ttc", "p_conservative": 0.4, "seed": 0, "cases": [1]}',
+        {"cases": []},
+        {"cases": [["flew", 1.0, None, None]]},
+        {"cases": [["success", "soon", None, None]]},
+        {"cases": [["success", 1.0, None, None, None]]},
+        {"cases": [1]},
+        {"cases": None},
+        {"p_conservative": None},
+        {"p_conservative": []},
+        {"p_conservative": [0.1]},
+        {"p_conservative": "many"},
+        {"tau_s": None},
+        {"percent": "all"},
     ],
 )
-def test_damaged_results_are_named(study: Path, damage: str) -> None:
-    (study / RESULTS / "1.json").write_text(damage)
-    with pytest.raises(InputError, match=r"1\.json is damaged"):
+def test_results_with_a_damaged_part_are_named(study: Path, change: dict[str, Any]) -> None:
+    content = SOME_RESULTS[0].to_json()
+    content["tested"][1] |= change
+    damage(study, json.dumps(content))
+
+
+def damage(study: Path, text: str) -> None:
+    """Write ``text`` in place of a result, and see that it is told in one line and that no report is made."""
+    file = study / RESULTS / "1.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"1\.json is damaged.*") as refusal:
         write_report(study)
-    assert not (study / "results.csv").exists()
+    assert "\n" not in str(refusal.value)
+    assert sorted(path.name for path in study.iterdir()) == [RESULTS]
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"result of a study: no file .*gone\.json"):
+        Result.read(tmp_path / "gone.json")

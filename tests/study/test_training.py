@@ -1,29 +1,42 @@
 import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
+from tests.study import runs
 from tint_sumo import traits
 from tint_sumo.config import PpoSettings, TraitSettings
 from tint_sumo.errors import InputError
-from tint_sumo.policy import EncoderTraits, RecurrentPPO
+from tint_sumo.policy import ClassifierTraits, EncoderTraits, OracleTraits, RecurrentPPO, StreamingTraits
+from tint_sumo.policy.network import GruPolicy
+from tint_sumo.policy.storage import load_policy_network, read_policy_card
 from tint_sumo.study.evaluation import CASE_SEED, evaluate
 from tint_sumo.study.loading import load_policy
-from tint_sumo.study.training import CHECKPOINT_FILE, train_policy
+from tint_sumo.study.training import CHECKPOINT_FILE, CURVE_FILE, ZIP_FILE, share_training, train_policy
 from tint_sumo.traits.storage import save
 
+SNAPSHOTS = ["policy-25.json", "policy-25.safetensors", "policy-50.json", "policy-50.safetensors"]
 SMALL_VAE = TraitSettings(embedding_sizes=(4, 4), hidden_size=4, encoder_output_size=4, decoder_output_size=4)
 
 
 @pytest.fixture
-def trait_model(tmp_path: Path) -> Path:
-    """A trait model nobody trained."""
-    torch.manual_seed(0)
-    save(traits.METHODS["vae"](SMALL_VAE), tmp_path / "some" / "encoder", {"seed": 0})
+def trait_model(encoders: Path, tmp_path: Path) -> Path:
+    """A trait model that may be changed."""
+    for suffix in (".json", ".safetensors"):
+        (tmp_path / "some").mkdir(exist_ok=True)
+        shutil.copyfile(encoders / f"vae{suffix}", tmp_path / "some" / f"encoder{suffix}")
     return tmp_path / "some" / "encoder.safetensors"
 
 
@@ -35,25 +48,76 @@ def interrupt_at(steps: int) -> Callable[[int, int, str], None]:
     return report
 
 
-def weights(file: Path) -> dict[str, torch.Tensor]:
-    return dict(RecurrentPPO.load(file).policy.state_dict())
+def files(out: Path) -> list[str]:
+    """What a user sees in a folder, apart from the log."""
+    return sorted(path.name for path in out.glob("[!.]*") if path.name != "tensorboard")
 
 
-def test_a_run_leaves_a_policy_and_its_card(tmp_path: Path, tiny: PpoSettings) -> None:
+def weights(policy: Path) -> dict[str, torch.Tensor]:
+    return dict(load_policy_network(policy.with_suffix("")).state_dict())
+
+
+def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(one[key], other[key]) for key in one.keys() | other.keys())
+
+
+def observed(source_of: Path, num_envs: int = 16) -> Any:
+    """What a trained policy sees at the beginning of some episodes."""
+    venv = load_policy(source_of).make_venv(num_envs, p_conservative=0.4)
+    venv.seed(7)
+    observation = venv.reset()
+    venv.close()
+    return observation
+
+
+# What a run leaves
+
+
+def test_a_run_leaves_a_policy_its_card_its_snapshots_and_its_curve(tmp_path: Path, brief: PpoSettings) -> None:
     out = tmp_path / "run"
     told: list[tuple[int, int]] = []
     policy = train_policy(
-        "no_labels", 0.25, 100, 3, out, settings=tiny, report=lambda done, total, _: told.append((done, total))
+        "no_labels", (0.25, 0.5), 250, 3, out, settings=brief, report=lambda done, total, _: told.append((done, total))
     )
-    assert policy == out / "policy.zip"
-    assert told == [(0, 100), (64, 100), (100, 100)]
-    assert RecurrentPPO.load(policy).num_timesteps == 128  # whole rollouts of 4 environments and 16 steps
+    assert policy == out / "policy.safetensors"
+    assert told == [(0, 250), (64, 250), (128, 250), (192, 250), (250, 250)]  # whole rollouts of 64
     card = json.loads((out / "policy.json").read_text())
-    assert (card["method"], card["p_conservative"], card["steps"], card["seed"]) == ("no_labels", 0.25, 100, 3)
+    assert (card["method"], card["p_conservative"], card["steps"], card["seed"]) == ("no_labels", [0.25, 0.5], 250, 3)
     assert card["settings"]["n_steps"] == 16
-    assert "libsumo" in card["versions"]
-    assert list((out / "tensorboard").iterdir())
-    assert sorted(path.name for path in out.glob("[!.]*")) == ["policy.json", "policy.zip", "run.json", "tensorboard"]
+    assert (card["traits"], card["traits_sha256"]) == (None, None)
+    assert {"libsumo", "torch", "python"} < set(card["versions"])
+    assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
+    assert not list(out.rglob("*.partial"))
+
+
+def test_the_log_and_the_curve_tell_the_outcomes_of_recent_episodes(tmp_path: Path, brief: PpoSettings) -> None:
+    notes: list[str] = []
+    train_policy("oracle", 0.4, 256, 0, tmp_path, settings=brief, report=lambda *told: notes.append(told[2]))
+    curve = pd.read_csv(tmp_path / CURVE_FILE)
+    assert list(curve) == ["decisions", "success", "timeout", "collision"]
+    assert curve["decisions"].tolist() == [64, 128, 192, 256]
+    assert (curve[["success", "timeout", "collision"]].sum(axis=1) == 1.0).all()
+    assert (curve["timeout"] == 1.0).all(), "episodes of 0.8 s end by their time limit"
+    assert notes == ["", *["success 0%, collision 0%"] * 4]
+    assert list((tmp_path / "tensorboard").iterdir())
+
+
+def test_snapshots_are_the_policies_after_parts_of_the_training(tmp_path: Path, tiny: PpoSettings) -> None:
+    policy = train_policy("oracle", 0.4, 512, 0, tmp_path, settings=tiny)
+    quarter, half = (tmp_path / f"policy-{percent}.safetensors" for percent in (25, 50))
+    assert [read_policy_card(one.with_suffix(""))["decisions"] for one in (quarter, half)] == [128, 256]
+    for one in (quarter, half):
+        assert not same(weights(one), weights(policy))
+        contender = load_policy(one)
+        assert contender.p_conservative == (0.4, 0.4)
+        actions, _ = contender.policy.predict(observed(one), deterministic=True)
+        assert actions.shape == (16,)
+    assert not same(weights(quarter), weights(half))
+
+
+def test_a_run_of_a_single_rollout_has_snapshots_too(tmp_path: Path, tiny: PpoSettings) -> None:
+    policy = train_policy("oracle", 0.4, 10, 0, tmp_path, settings=tiny)
+    assert all(same(weights(tmp_path / f"policy-{percent}.safetensors"), weights(policy)) for percent in (25, 50))
 
 
 def test_a_finished_run_is_not_repeated(tmp_path: Path, tiny: PpoSettings) -> None:
@@ -64,36 +128,89 @@ def test_a_finished_run_is_not_repeated(tmp_path: Path, tiny: PpoSettings) -> No
 
 
 def test_the_seed_decides(tmp_path: Path, tiny: PpoSettings) -> None:
-    one, same, other = (
+    one, again, other = (
         weights(train_policy("oracle", 0.4, 64, seed, tmp_path / name, settings=tiny))
-        for name, seed in (("one", 0), ("same", 0), ("other", 1))
+        for name, seed in (("one", 0), ("again", 0), ("other", 1))
     )
-    assert all(torch.equal(one[key], same[key]) for key in one)
-    assert not all(torch.equal(one[key], other[key]) for key in one)
+    assert same(one, again)
+    assert not same(one, other)
 
 
-def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, tiny: PpoSettings) -> None:
+def test_a_loaded_policy_acts_as_the_trained_one(
+    tmp_path: Path, tiny: PpoSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained: list[GruPolicy] = []
+    original = RecurrentPPO.learn
+
+    def learn(model: RecurrentPPO, *args: Any, **kwargs: Any) -> RecurrentPPO:
+        trained.append(model.policy)
+        return original(model, *args, **kwargs)
+
+    monkeypatch.setattr(RecurrentPPO, "learn", learn)
+    train_policy("oracle", 0.4, 64, 0, tmp_path, settings=tiny)
+    observation = observed(tmp_path)
+    assert set(observation) == {"ego", "vehicles", "mask", "traits"}
+    actions, (states,) = load_policy(tmp_path).policy.predict(observation, deterministic=True)
+    expected, (expected_states,) = trained[0].predict(observation, deterministic=True)
+    np.testing.assert_array_equal(actions, expected)
+    np.testing.assert_array_equal(states, expected_states)
+
+
+def test_decisions_can_last_several_steps(tmp_path: Path, tiny: PpoSettings) -> None:
+    train_policy("oracle", 0.4, 64, 0, tmp_path, settings=replace(tiny, action_repeat=5))
+    contender = load_policy(tmp_path)
+    venv = contender.make_venv(2, p_conservative=0.4)
+    venv.seed(0)
+    start_y_m = 20.0 * venv.reset()["ego"][:, 1]
+    y_m = 20.0 * venv.step(np.array([2, 2]))[0]["ego"][:, 1]
+    venv.close()
+    assert y_m - start_y_m == pytest.approx(3.0 * 0.1**2 * (1 + 2 + 3 + 4 + 5), abs=1e-3)  # five steps at 3 m/s2
+
+
+# Interruptions
+
+
+def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, brief: PpoSettings) -> None:
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        train_policy("oracle", 0.4, 256, 0, out, settings=tiny, report=interrupt_at(128))
-    assert sorted(path.name for path in out.glob("[!.]*")) == [CHECKPOINT_FILE, "run.json", "tensorboard"]
+        train_policy("oracle", 0.4, 512, 0, out, settings=brief, report=interrupt_at(256))
+    assert files(out) == [CHECKPOINT_FILE, CURVE_FILE, *SNAPSHOTS[:2], "run.json"]
     with pytest.raises(InputError, match="not finished"):
         load_policy(out)
+    assert load_policy(out / "policy-25").p_conservative == (0.4, 0.4)
+    kept = (out / "policy-25.safetensors").stat().st_mtime_ns
     told: list[int] = []
-    train_policy("oracle", 0.4, 256, 0, out, settings=tiny, report=lambda done, *_: told.append(done))
-    assert told == [64, 128, 192, 256]  # the rollout that nothing was learnt from is collected again
-    assert RecurrentPPO.load(out / "policy.zip")._n_updates == 4
-    assert not (out / CHECKPOINT_FILE).exists()
+    train_policy("oracle", 0.4, 512, 0, out, settings=brief, report=lambda done, *_: told.append(done))
+    assert told == [192, 256, 320, 384, 448, 512]  # the rollout that nothing was learnt from is collected again
+    assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
+    assert (out / "policy-25.safetensors").stat().st_mtime_ns == kept
+    assert pd.read_csv(out / CURVE_FILE)["decisions"].tolist() == [64 * rollout for rollout in range(1, 9)]
+
+
+def test_a_resumed_run_learns_as_often_as_one_at_a_stretch(tmp_path: Path, tiny: PpoSettings) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        train_policy("oracle", 0.4, 256, 0, tmp_path, settings=tiny, report=interrupt_at(128))
+    train_policy("oracle", 0.4, 256, 0, tmp_path, settings=tiny, with_zip=True)
+    model = RecurrentPPO.load(tmp_path / ZIP_FILE)
+    assert (model.num_timesteps, model._n_updates) == (256, 4)
+
+
+def test_a_run_may_be_interrupted_again_and_again(tmp_path: Path, brief: PpoSettings) -> None:
+    for steps in (64, 128, 128, 192):
+        with pytest.raises(KeyboardInterrupt):
+            train_policy("oracle", 0.4, 256, 0, tmp_path, settings=brief, report=interrupt_at(steps))
+    train_policy("oracle", 0.4, 256, 0, tmp_path, settings=brief)
+    assert pd.read_csv(tmp_path / CURVE_FILE)["decisions"].tolist() == [64, 128, 192, 256]
 
 
 def test_a_resumed_run_meets_new_episodes(tmp_path: Path, tiny: PpoSettings, monkeypatch: pytest.MonkeyPatch) -> None:
     seeds: list[int] = []
     original = RecurrentPPO.learn
 
-    def learn(model: RecurrentPPO, *args: object, **kwargs: object) -> object:
+    def learn(model: RecurrentPPO, *args: Any, **kwargs: Any) -> RecurrentPPO:
         assert model.env is not None
         seeds.extend(model.env.unwrapped._seeds)
-        return original(model, *args, **kwargs)  # type: ignore[arg-type]
+        return original(model, *args, **kwargs)
 
     monkeypatch.setattr(RecurrentPPO, "learn", learn)
     with pytest.raises(KeyboardInterrupt):
@@ -103,12 +220,49 @@ def test_a_resumed_run_meets_new_episodes(tmp_path: Path, tiny: PpoSettings, mon
     assert max(seeds) < CASE_SEED
 
 
+@pytest.mark.slow
+def test_a_killed_run_leaves_whole_files_and_goes_on(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    process = subprocess.Popen([sys.executable, "-m", "tests.study.runs", str(out)])
+    try:
+        end = time.monotonic() + 120.0
+        while not (out / "policy-25.json").exists():
+            assert process.poll() is None, "the training ended before it was killed"
+            assert time.monotonic() < end, "waited in vain"
+            time.sleep(0.01)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert not (out / "policy.json").exists()
+    done = RecurrentPPO.load(out / CHECKPOINT_FILE).num_timesteps
+    assert runs.STEPS / 4 <= done < runs.STEPS
+    assert pd.read_csv(out / CURVE_FILE)["decisions"].is_monotonic_increasing
+    told: list[int] = []
+    train_policy(
+        runs.METHOD,
+        0.4,
+        runs.STEPS,
+        runs.SEED,
+        out,
+        settings=runs.SETTINGS,
+        report=lambda steps, *_: told.append(steps),
+    )
+    assert told[0] == done
+    assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
+    assert not list(out.rglob("*.partial"))
+    assert pd.read_csv(out / CURVE_FILE)["decisions"].tolist() == list(range(64, runs.STEPS + 1, 64))
+    assert all(load_policy(out / name) for name in ("policy-25", "policy-50", "policy"))
+
+
 def test_a_damaged_checkpoint_is_named(tmp_path: Path, tiny: PpoSettings) -> None:
     with pytest.raises(KeyboardInterrupt):
         train_policy("oracle", 0.4, 128, 0, tmp_path, settings=tiny, report=interrupt_at(64))
     (tmp_path / CHECKPOINT_FILE).write_bytes(b"nonsense")
     with pytest.raises(InputError, match=CHECKPOINT_FILE):
         train_policy("oracle", 0.4, 128, 0, tmp_path, settings=tiny)
+
+
+# Folders and arguments
 
 
 def test_another_run_s_folder_is_refused(tmp_path: Path, tiny: PpoSettings) -> None:
@@ -123,37 +277,40 @@ def test_another_run_s_folder_is_refused(tmp_path: Path, tiny: PpoSettings) -> N
     ("method", "p_conservative", "steps", "seed", "message"),
     [
         ("magic", 0.4, 64, 0, "unknown method"),
+        ("ours", 0.4, 64, 0, "ours is now called vae"),
         ("ttc", 0.4, 64, 0, "hand-written rule"),
         ("oracle", 1.5, 64, 0, "p_conservative"),
+        ("oracle", (0.9, 0.1), 64, 0, "p_conservative"),
         ("oracle", 0.4, 0, 0, "steps"),
         ("oracle", 0.4, 64, -1, "seed"),
     ],
 )
 def test_bad_values_leave_no_folder(
-    tmp_path: Path, tiny: PpoSettings, method: str, p_conservative: float, steps: int, seed: int, message: str
+    tmp_path: Path, tiny: PpoSettings, method: str, p_conservative: Any, steps: int, seed: int, message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
         train_policy(method, p_conservative, steps, seed, tmp_path / "run", settings=tiny)
     assert not (tmp_path / "run").exists()
 
 
+# Trait models
+
+
 def test_the_trait_model_travels_with_the_policy(tmp_path: Path, tiny: PpoSettings, trait_model: Path) -> None:
     policy = train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
     trait_model.unlink()
     moved = (tmp_path / "run").rename(tmp_path / "moved")
-    for path in (moved, moved / policy.name):
+    for path in (moved, moved / policy.name, moved / "policy-25"):
         contender = load_policy(path)
         assert contender.source is not None
         assert isinstance(contender.source(), EncoderTraits)
-        assert contender.p_conservative == 0.4
-    found = evaluate(contender.policy, lambda num_envs: contender.make_venv(num_envs, 1.0), 2, 0)
+    found = evaluate(contender.policy, lambda num_envs: contender.make_venv(num_envs, p_conservative=1.0), 2, 0)
     assert len(found.cases) == 2
 
 
 def test_another_trait_model_is_another_run(tmp_path: Path, tiny: PpoSettings, trait_model: Path) -> None:
     train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
-    other = traits.METHODS["vae"](SMALL_VAE)
-    save(other, trait_model.with_suffix(""), {})
+    save(traits.METHODS["vae"](SMALL_VAE), trait_model.with_suffix(""), {})
     with pytest.raises(InputError, match=r"another run \(different: traits\)"):
         train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
 
@@ -165,25 +322,96 @@ def test_a_trait_model_of_another_latent_size_is_refused(tmp_path: Path, tiny: P
     assert not (tmp_path / "run").exists()
 
 
-def test_a_loaded_policy_acts_as_the_trained_one(tmp_path: Path, tiny: PpoSettings) -> None:
-    policy = train_policy("oracle", 0.4, 64, 0, tmp_path, settings=tiny)
-    contender = load_policy(tmp_path)
-    venv = contender.make_venv(3, 0.4)
-    venv.seed(7)
-    observation = venv.reset()
-    venv.close()
-    assert set(observation) == {"ego", "vehicles", "mask", "traits"}
-    actions, _ = contender.policy.predict(observation, deterministic=True)
-    expected, _ = RecurrentPPO.load(policy).predict(observation, deterministic=True)
-    np.testing.assert_array_equal(actions, expected)
+def test_a_trait_model_that_cannot_stream_is_refused(tmp_path: Path, tiny: PpoSettings, trait_model: Path) -> None:
+    with pytest.raises(InputError, match="streaming needs the posteriors of a cross_window model, not of vae"):
+        train_policy("streaming", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
+    assert not (tmp_path / "run").exists()
 
 
-def test_decisions_can_last_several_steps(tmp_path: Path, tiny: PpoSettings) -> None:
-    train_policy("oracle", 0.4, 64, 0, tmp_path, settings=replace(tiny, action_repeat=5))
+# What the methods differ in
+
+
+def test_without_attention_there_are_no_scores(tmp_path: Path, tiny: PpoSettings, encoders: Path) -> None:
+    policy = train_policy("no_attention", 0.4, 64, 0, tmp_path, settings=tiny, traits=encoders / "vae.safetensors")
+    assert not any(".score." in name for name in weights(policy))
+    assert read_policy_card(tmp_path / "policy")["settings"]["policy"]["attention"] is False
+
+
+def test_a_critic_that_sees_true_traits_is_trained_and_the_policy_drives_without_them(
+    tmp_path: Path, tiny: PpoSettings, encoders: Path
+) -> None:
+    settings = replace(tiny, n_steps=32)
+    train_policy(
+        "streaming_critic", 0.4, 128, 0, tmp_path, settings=settings, traits=encoders / "cross_window.safetensors"
+    )
+    assert read_policy_card(tmp_path / "policy")["network"] | {"settings": None} == {
+        "settings": None,
+        "trait_size": 5,
+        "critic_sees_true_traits": True,
+    }
     contender = load_policy(tmp_path)
-    venv = contender.make_venv(2, 0.4)
-    venv.seed(0)
-    start_y_m = 20.0 * venv.reset()["ego"][:, 1]
-    y_m = 20.0 * venv.step(np.array([2, 2]))[0]["ego"][:, 1]
-    venv.close()
-    assert y_m - start_y_m == pytest.approx(3.0 * 0.1**2 * (1 + 2 + 3 + 4 + 5), abs=1e-3)  # five steps at 3 m/s2
+    assert contender.source is not None and isinstance(contender.source(), StreamingTraits)
+    assert set(observed(tmp_path)) == {"ego", "vehicles", "mask", "traits"}
+    found = evaluate(contender.policy, lambda num_envs: contender.make_venv(num_envs, p_conservative=0.9), 2, 0)
+    assert len(found.cases) == 2
+
+
+def test_what_the_critic_sees_is_learnt_from(tmp_path: Path, tiny: PpoSettings, encoders: Path) -> None:
+    settings = replace(tiny, learning_rate=1e-2)
+    train_policy(
+        "streaming_critic", 0.4, 256, 0, tmp_path, settings=settings, traits=encoders / "cross_window.safetensors"
+    )
+    before, after = (weights(tmp_path / f"{name}.safetensors") for name in ("policy-25", "policy"))
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert any(name.startswith("critic_extractor.") for name in changed)
+    assert any(name.startswith("critic_hint.") for name in changed)
+
+
+def test_ma_is_trained_on_true_traits_and_drives_with_predicted_ones(
+    tmp_path: Path, tiny: PpoSettings, encoders: Path
+) -> None:
+    oracle = train_policy("oracle", 0.4, 64, 0, tmp_path / "oracle", settings=tiny)
+    ma = train_policy("ma", 0.4, 64, 0, tmp_path / "ma", settings=tiny, traits=encoders / "classifier.safetensors")
+    assert same(weights(oracle), weights(ma))
+    source = load_policy(ma).source
+    assert source is not None and isinstance(source(), ClassifierTraits)
+
+
+def test_a_shared_training_gives_the_same_actions_with_another_source(
+    tmp_path: Path, tiny: PpoSettings, encoders: Path
+) -> None:
+    train_policy("oracle", (0.1, 0.9), 128, 5, tmp_path / "oracle", settings=tiny)
+    share_training(tmp_path / "oracle", "ma", tmp_path / "ma", encoders / "classifier.safetensors")
+    card = read_policy_card(tmp_path / "ma" / "policy")
+    assert (card["method"], card["trained_as"], card["seed"], card["traits"]) == ("ma", "oracle", 5, "traits")
+    observation = observed(tmp_path / "oracle")
+    for name in ("policy-25", "policy-50", "policy"):
+        oracle, ma = (load_policy(tmp_path / method / name) for method in ("oracle", "ma"))
+        actions, expected = (one.policy.predict(observation, deterministic=True)[0] for one in (ma, oracle))
+        np.testing.assert_array_equal(actions, expected)
+        assert ma.p_conservative == (0.1, 0.9)
+        assert oracle.source is not None and isinstance(oracle.source(), OracleTraits)
+        assert ma.source is not None and isinstance(ma.source(), ClassifierTraits)
+    written = (tmp_path / "ma" / "policy.safetensors").read_bytes()
+    share_training(tmp_path / "oracle", "ma", tmp_path / "ma", encoders / "classifier.safetensors")
+    assert (tmp_path / "ma" / "policy.safetensors").read_bytes() == written
+
+
+def test_a_training_that_is_not_finished_is_not_shared(tmp_path: Path, tiny: PpoSettings, encoders: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        train_policy("oracle", 0.4, 256, 0, tmp_path / "oracle", settings=tiny, report=interrupt_at(256))
+    with pytest.raises(InputError, match=r"no file .*policy\.json"):
+        share_training(tmp_path / "oracle", "ma", tmp_path / "ma", encoders / "classifier.safetensors")
+    assert not (tmp_path / "ma" / "policy.json").exists()
+
+
+def test_a_zip_file_is_written_on_demand_and_read_with_permission(tmp_path: Path, tiny: PpoSettings) -> None:
+    policy = train_policy("oracle", 0.4, 64, 0, tmp_path, settings=tiny, with_zip=True)
+    assert RecurrentPPO.load(tmp_path / ZIP_FILE).num_timesteps == 64
+    with pytest.raises(InputError, match="a pickle, which can run any code"):
+        load_policy(tmp_path / ZIP_FILE)
+    actions = [
+        one.policy.predict(observed(policy), deterministic=True)[0]
+        for one in (load_policy(policy), load_policy(tmp_path / ZIP_FILE, allow_pickle=True))
+    ]
+    np.testing.assert_array_equal(*actions)

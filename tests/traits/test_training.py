@@ -128,7 +128,7 @@ def test_large_networks_train_in_bfloat16(windows, small, tmp_path):
     assert all(value.dtype == torch.float32 and value.isfinite().all() for value in model.state_dict().values())
 
 
-@pytest.mark.parametrize("method", ["classifier", "vae", "cross_window"])  # at constant speed morton has nothing to learn
+@pytest.mark.parametrize("method", ["classifier", "vae", "cross_window"])  # morton learns nothing from constant speed
 def test_two_populations_separate(small, tmp_path, method):
     windows, slow = two_populations(1000)
     labels = slow if METHODS[method].uses_labels else None

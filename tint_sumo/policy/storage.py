@@ -55,10 +55,12 @@ def load_policy_network(stem: Path) -> GruPolicy:
     network = read_policy_card(stem)[_NETWORK]
     try:
         policy = _build(network)
-    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, MemoryError, RuntimeError) as error:
         raise InputError(f"{card_file(stem)}: unusable network ({error!r}); restore the file") from None
     try:
         safetensors.torch.load_model(policy, weights_file(stem))
+    except FileNotFoundError:
+        raise InputError(f"policy: no file {weights_file(stem)}; restore it or train the policy again") from None
     except (OSError, SafetensorError):
         raise InputError(f"{weights_file(stem)} is damaged; restore the file or train the policy again") from None
     except RuntimeError:

@@ -29,7 +29,7 @@ class Conditions:
 
 
 @dataclass(frozen=True)
-class Test:
+class Trials:
     """Some conditions, each with so many cases, which are the same for all policies."""
 
     conditions: tuple[Conditions, ...]
@@ -47,7 +47,7 @@ class Budget:
     methods: tuple[str, ...] = ("always_go", "ttc", "no_labels", "vae", "oracle")
     mixes: tuple[Share, ...] = (ALL_MIXES,)  # P(conservative) in training: a policy for each
     seeds: tuple[int, ...] = (0, 1, 2)
-    tests: tuple[Test, ...] = ()
+    trials: tuple[Trials, ...] = ()
     with_shipped: bool = False  # test the shipped policies, too
 
 
@@ -110,7 +110,7 @@ BUDGETS = {
         traits=TRAIT_BUDGETS["quick"],
         ppo=replace(_FULL_PPO, n_envs=64, total_steps=200_000),
         seeds=(0,),
-        tests=(Test(tuple(Conditions(p) for p in P_CONSERVATIVE), 200),),
+        trials=(Trials(tuple(Conditions(p) for p in P_CONSERVATIVE), 200),),
         with_shipped=True,
     ),
     "full": Budget(
@@ -118,16 +118,16 @@ BUDGETS = {
         ppo=_FULL_PPO,
         methods=("always_go", "ttc", *_TRAINED),
         seeds=(0, 1, 2),
-        tests=(
-            Test(tuple(Conditions(p) for p in (0.1, 0.25, 0.4, 0.6, 0.9)), 1000),
-            Test(
+        trials=(
+            Trials(tuple(Conditions(p) for p in (0.1, 0.25, 0.4, 0.6, 0.9)), 1000),
+            Trials(
                 (
                     Conditions(ALL_MIXES),
                     *(Conditions(ALL_MIXES, position_noise_m=noise_m) for noise_m in (0.05, 0.1, 0.2)),
                     *(Conditions(ALL_MIXES, tau_s=tau_s) for tau_s in (0.7, 1.5)),
                     *(Conditions(ALL_MIXES, percent=percent) for percent in (25, 50)),
                 ),
-                500,
+                300,
             ),
         ),
     ),
@@ -135,7 +135,7 @@ BUDGETS = {
         traits=TRAIT_BUDGETS["paper"],
         windows=696_000,  # the number of the paper's trajectories
         mixes=P_CONSERVATIVE,
-        tests=(Test(tuple(Conditions(p) for p in P_CONSERVATIVE), 500),),  # paper IV-C
+        trials=(Trials(tuple(Conditions(p) for p in P_CONSERVATIVE), 500),),  # paper IV-C
     ),
 }
 

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, write_json
-from tint_sumo.study.budgets import Conditions, Test
+from tint_sumo.study.budgets import Conditions, Trials
 from tint_sumo.study.ceiling import ceiling
 from tint_sumo.study.policy_jobs import CASES
 from tint_sumo.study.progress import Report
@@ -16,7 +17,7 @@ CEILINGS_FILE = "ceilings.json"
 class CeilingJob:
     """Compute the ceiling for each P(conservative) that policies are tested at."""
 
-    tests: tuple[Test, ...]
+    trials: tuple[Trials, ...]
     out: Path  # of the study
 
     name = "ceilings"
@@ -27,9 +28,9 @@ class CeilingJob:
 
     def run(self, report: Report) -> str:
         wanted = {
-            one.p_conservative: test.episodes
-            for test in self.tests
-            for one in test.conditions
+            one.p_conservative: trials.episodes
+            for trials in self.trials
+            for one in trials.conditions
             if isinstance(one.p_conservative, float) and one == Conditions(one.p_conservative)
         }
         found = {}
@@ -41,6 +42,14 @@ class CeilingJob:
 
 
 def read_ceilings(out: Path) -> dict[float, float]:
-    """Ceilings by P(conservative); none if the study has not computed them."""
+    """Ceilings by P(conservative); none if the study has not computed them.
+
+    Raises:
+        InputError: the file is damaged.
+    """
     file = out / CEILINGS_FILE
-    return {float(p): share for p, share in read_json(file, "ceilings").items()} if file.exists() else {}
+    found = read_json(file, "ceilings") if file.exists() else {}
+    try:
+        return {float(p): float(share) for p, share in found.items()}
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{file} is damaged ({error}); remove it and run the study again") from None

@@ -39,12 +39,17 @@ def plot_bars(rows: Sequence[Row], file: Path) -> Path:
         _plot_panel(axes, group)
         axes.set_title(f"P(conservative) = {p_conservative:g}", fontsize=10)
         axes.tick_params(labelbottom=True)
-        if position % columns:
+        if position % columns and _titles(group) == _titles(panels[position - 1][1]):
             axes.tick_params(labelleft=False)
     figure.supxlabel("share of the cases (%)", fontsize=10)
-    entries = dict(zip(*reversed(all_axes[0, 0].get_legend_handles_labels()), strict=True))
+    legends = [axes.get_legend_handles_labels() for axes in all_axes.flat]
+    entries = {label: handle for legend in legends for handle, label in zip(*legend, strict=True)}
     figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     return _write(figure, file)
+
+
+def _titles(rows: Sequence[Row]) -> list[str]:
+    return [row.title for row in rows]
 
 
 def _plot_panel(axes: Axes, rows: Sequence[Row]) -> None:
@@ -67,7 +72,7 @@ def _plot_panel(axes: Axes, rows: Sequence[Row]) -> None:
     published = [row.published.get("success", float("nan")) for row in rows]
     if not np.isnan(published).all():
         axes.plot(published, [position - 0.44 for position in positions], "kv", ms=4, label="success in the paper")
-    axes.set_yticks(list(positions), [row.title for row in rows], fontsize=8)
+    axes.set_yticks(list(positions), _titles(rows), fontsize=8)
     axes.set_xlim(0, 100)
     axes.invert_yaxis()
     axes.spines[["top", "right"]].set_visible(False)
@@ -87,7 +92,7 @@ def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Pat
         percent = 100.0 * pd.concat(shares, axis=1).dropna()
         style: dict[str, Any] = {
             "color": f"C{position}",
-            "marker": _MARKERS[position],
+            "marker": _MARKERS[position % len(_MARKERS)],
             "markevery": 0.12,
             "ms": 4,
             "lw": 1.3,
@@ -133,7 +138,7 @@ def _plot_line(axes: Axes, rows: Sequence[Row], name: str, position: int) -> Non
         limits = np.array([[100.0 * end for end in points[value].intervals["success"]] for value in values]).T
         style: dict[str, Any] = {
             "color": f"C{position}",
-            "marker": _MARKERS[position],
+            "marker": _MARKERS[position % len(_MARKERS)],
             "ms": 4,
             "lw": 1.2,
             "capsize": 2,
@@ -141,14 +146,10 @@ def _plot_line(axes: Axes, rows: Sequence[Row], name: str, position: int) -> Non
         axes.errorbar(values, percent, yerr=np.abs(limits - percent), label=rows[0].title, **style)
 
 
-def _style(position: int) -> dict[str, Any]:
-    return {"color": f"C{position}", "marker": _MARKERS[position], "ms": 4, "lw": 1.2}
-
-
 def _by_method(rows: Sequence[Row]) -> dict[str, list[Row]]:
     found: dict[str, list[Row]] = {name: [] for name in METHODS}
     for row in rows:
-        found[row.method].append(row)
+        found.setdefault(row.method, []).append(row)
     return {name: own for name, own in found.items() if own}
 
 

@@ -10,7 +10,7 @@ from tint_sumo.study.budgets import Budget
 from tint_sumo.study.ceiling_job import CeilingJob
 from tint_sumo.study.loading import shipped_policies
 from tint_sumo.study.methods import Learned, find_method
-from tint_sumo.study.policy_jobs import TestJob, TrainJob
+from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
 from tint_sumo.study.pool import Job, run_jobs
 from tint_sumo.study.report import StudyReport, write_report
 from tint_sumo.study.trait_job import DATASET, SEED, TraitJob
@@ -29,8 +29,8 @@ def plan(budget: Budget, out: Path) -> list[Job]:
         grid = [(method.name, mix, seed) for mix in budget.mixes for method in learned]
         trainings = [TrainJob(*policy, budget.ppo, budget.traits is None, out) for policy in grid]
         jobs += sorted(trainings, key=lambda job: len(job.needs))
-        jobs += [TestJob(*policy, budget.tests, out) for policy in grid]
-    return [*jobs, CeilingJob(budget.tests, out), *(TestJob(name, None, 0, budget.tests, out) for name in given)]
+        jobs += [EvaluateJob(*policy, budget.trials, out) for policy in grid]
+    return [*jobs, CeilingJob(budget.trials, out), *(EvaluateJob(name, None, 0, budget.trials, out) for name in given)]
 
 
 def run_study(budget: Budget, out: Path, *, workers: int = 2, progress: bool = True) -> StudyReport:

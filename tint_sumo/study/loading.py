@@ -127,6 +127,10 @@ def _checked_card(stem: Path) -> dict[str, Any]:
     settings = card.get("settings")
     fits = isinstance(method, Learned) and is_share(card.get("p_conservative"))
     fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
-    if not fits or (isinstance(method, Learned) and method.encoder and not isinstance(card.get("traits"), str)):
+    if not fits or (isinstance(method, Learned) and method.encoder and not _is_file_name(card.get("traits"))):
         raise InputError(f"{card_file(stem)} is not the card of a policy; restore the file or train the policy again")
     return card
+
+
+def _is_file_name(value: object) -> bool:
+    return isinstance(value, str) and value != "" and Path(value).name == value

@@ -9,14 +9,15 @@ import pandas as pd
 import torch
 
 from tint_sumo.config import PpoSettings, Share, ends
+from tint_sumo.errors import InputError
 from tint_sumo.files import write_json
-from tint_sumo.study.budgets import Conditions, Test
-from tint_sumo.study.evaluation import Evaluation, evaluate
+from tint_sumo.study.budgets import Conditions, Trials
+from tint_sumo.study.evaluation import OUTCOMES, Evaluation, evaluate
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import METHODS, Rule, find_learned, find_method
 from tint_sumo.study.pool import THREADS_PER_JOB
 from tint_sumo.study.progress import Report
-from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Result, Tested
+from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Measured, Result
 from tint_sumo.study.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
 
 CASES = 0  # the set of cases that all policies are tested on
@@ -76,18 +77,18 @@ class TrainJob:
 
 
 @dataclass(frozen=True)
-class TestJob:
-    """Test a trained policy, a shipped one, or a rule."""
+class EvaluateJob:
+    """Evaluate a trained policy, a shipped one, or a rule."""
 
     method: str
     mix: Share | None  # of its training; None: a rule or a shipped policy
     seed: int
-    tests: tuple[Test, ...]
+    trials: tuple[Trials, ...]
     out: Path  # of the study
 
     @property
     def name(self) -> str:
-        return f"test {self._label}"
+        return f"evaluate {self._label}"
 
     @property
     def _label(self) -> str:
@@ -107,12 +108,12 @@ class TestJob:
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
         began = time.monotonic()
-        wanted = [(one, test.episodes) for test in self.tests for one in test.conditions if self._meets(one)]
+        wanted = [(one, trials.episodes) for trials in self.trials for one in trials.conditions if self._meets(one)]
         total, done = sum(episodes for _, episodes in wanted), 0
-        tested: list[Tested] = []
+        tested: list[Measured] = []
         for conditions, episodes in wanted:
             evaluation = self._test(conditions, episodes, partial(_shifted, report, done, total))
-            tested.append(Tested(conditions, evaluation))
+            tested.append(Measured(conditions, evaluation))
             done += episodes
         origin = GIVEN if self.mix is None else TRAINED
         write_json(self.result_file, Result(self.method, origin, self.mix, self.seed, tuple(tested)).to_json())
@@ -140,7 +141,7 @@ class TestJob:
 
 
 def _shifted(report: Report, before: int, total: int, done: int, _: int, note: str) -> None:
-    """Report cases of one test among those of all tests."""
+    """Report cases under some conditions among those under all."""
     report(before + done, total, note)
 
 
@@ -153,6 +154,21 @@ def label(method: str, mix: Share | None, seed: int) -> str:
 
 
 def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
-    """Curves of the trainings of the study in ``out``, one per seed, by method in the registry's order."""
-    found = {name: sorted((out / "policies").glob(f"{name}-P*/{CURVE_FILE}")) for name in METHODS}
-    return {name: [pd.read_csv(file) for file in files] for name, files in found.items() if files}
+    """Curves of the trainings of the study in ``out``, one per seed, by method in the registry's order.
+
+    A training in which no episode has ended yet has none.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    files = {name: sorted((out / "policies").glob(f"{name}-P*/{CURVE_FILE}")) for name in METHODS}
+    found = {name: [curve for curve in map(_read_curve, own) if len(curve)] for name, own in files.items()}
+    return {name: curves for name, curves in found.items() if curves}
+
+
+def _read_curve(file: Path) -> pd.DataFrame:
+    try:
+        return pd.read_csv(file, dtype=float)[["decisions", *OUTCOMES]]
+    except (KeyError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{file} is damaged ({reason}); restore or remove it") from None

@@ -15,7 +15,7 @@ TRAINED, GIVEN = "trained", "given"  # where a policy comes from: the study itse
 
 
 @dataclass(frozen=True)
-class Tested:
+class Measured:
     """How a policy fared under some conditions."""
 
     conditions: Conditions
@@ -30,7 +30,7 @@ class Result:
     origin: str  # TRAINED or GIVEN
     mix: Share | None  # P(conservative) in training; None where the study did not train
     seed: int
-    tested: tuple[Tested, ...]
+    tested: tuple[Measured, ...]
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -53,19 +53,20 @@ class Result:
         """Raises InputError if the file is damaged."""
         content = read_json(file, "result of a study")
         try:
-            tested = tuple(Tested(_conditions(one), _evaluation(one)) for one in content["tested"])
+            tested = tuple(Measured(_conditions(one), _evaluation(one)) for one in content["tested"])
             result = cls(content["method"], content["origin"], _share(content["mix"]), int(content["seed"]), tested)
-        except (KeyError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError) as error:
             raise InputError(f"{file} is damaged ({error!r}); remove it and run the study again") from None
-        cases = [case for one in tested for case in one.evaluation.cases]
-        if not cases or any(case.outcome not in OUTCOMES for case in cases):
+        all_cases = [one.evaluation.cases for one in tested]
+        if not all(all_cases) or any(case.outcome not in OUTCOMES for cases in all_cases for case in cases):
             raise InputError(f"{file} is damaged (no cases, or unknown outcomes); remove it and run the study again")
         return result
 
 
 def _conditions(one: dict[str, Any]) -> Conditions:
     share = _share(one["p_conservative"])
-    assert share is not None
+    if share is None:
+        raise ValueError("no p_conservative")
     return Conditions(share, float(one["position_noise_m"]), float(one["tau_s"]), int(one["percent"]))
 
 

@@ -102,6 +102,8 @@ def train_policy(
     }
     stem = snapshot_stem(out, 100)
     with claim_folder(out, identity):
+        if with_zip and card_file(stem).exists() and not (out / ZIP_FILE).exists():
+            raise InputError(f"{out} holds a finished run without {ZIP_FILE}; train into another folder to have one")
         if not card_file(stem).exists():
             if encoder is not None:
                 save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
@@ -130,7 +132,9 @@ def share_training(source: Path, method: str, out: Path, traits: str | Path | No
     learned = find_learned(method)
     encoder = _load_encoder(learned, traits)
     assert encoder is not None
-    with claim_folder(out, {"kind": "policy", "method": method, "traits": digest(encoder)}):
+    shared = read_policy_card(snapshot_stem(source, 100))
+    training = {key: shared[key] for key in ("method", "p_conservative", "steps", "seed")}
+    with claim_folder(out, {"kind": "policy", "method": method, "traits": digest(encoder), "training": training}):
         save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
         for percent in (*SNAPSHOTS_PERCENT, 100):
             stem = snapshot_stem(source, percent)
@@ -146,9 +150,7 @@ def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | N
     return encoder
 
 
-def training_venv(
-    learned: Learned, encoder: TraitModel | None, p_conservative: Share, settings: PpoSettings
-) -> VecEnv:
+def training_venv(learned: Learned, encoder: TraitModel | None, p_conservative: Share, settings: PpoSettings) -> VecEnv:
     """Environments with the traits that the method is trained with."""
     shown = learned if learned.trained_as is None else find_learned(learned.trained_as)
     venv = TIntersectionVecEnv(settings.n_envs, p_conservative=p_conservative, time_limit_s=settings.time_limit_s)

@@ -1,0 +1,86 @@
+import json
+from dataclasses import asdict
+
+import pytest
+
+from tint_sumo import traits
+from tint_sumo.config import P_CONSERVATIVE, Idm, PpoSettings, TraitSettings, ends, is_share
+from tint_sumo.errors import InputError
+from tint_sumo.study.budgets import ALL_MIXES, BUDGETS, TRAIT_BUDGETS, Conditions, find_budget
+from tint_sumo.study.methods import Learned, find_method
+from tint_sumo.study.training import SNAPSHOTS_PERCENT
+
+
+@pytest.mark.parametrize("name", BUDGETS)
+def test_every_budget_can_be_run(name: str) -> None:
+    budget = find_budget(name)
+    assert any(isinstance(find_method(method), Learned) for method in budget.methods)
+    assert len(set(budget.methods)) == len(budget.methods)
+    assert budget.ppo.n_minibatches <= budget.ppo.n_envs
+    assert all(map(is_share, budget.mixes))
+    assert (budget.traits is None) == (budget.windows == 0), "windows are recorded for trait models alone"
+    assert json.loads(json.dumps(asdict(budget)))["seeds"] == list(budget.seeds)
+
+
+@pytest.mark.parametrize("name", BUDGETS)
+def test_every_policy_is_tested_somewhere_after_a_part_of_the_training_that_is_kept(name: str) -> None:
+    budget = find_budget(name)
+    conditions = [one for trials in budget.trials for one in trials.conditions]
+    assert len(set(conditions)) == len(conditions)
+    assert {one.percent for one in conditions} <= {100, *SNAPSHOTS_PERCENT}
+    for mix in budget.mixes:
+        low, high = ends(mix)
+        assert any(low <= ends(one.p_conservative)[0] and ends(one.p_conservative)[1] <= high for one in conditions)
+
+
+@pytest.mark.parametrize("name", BUDGETS)
+def test_what_shares_a_training_comes_with_it(name: str) -> None:
+    methods = BUDGETS[name].methods
+    learned = [method for method in map(find_method, methods) if isinstance(method, Learned)]
+    assert all(method.trained_as in (None, *methods) for method in learned)
+
+
+def test_the_paper_s_budget_is_the_paper_s() -> None:
+    paper = BUDGETS["paper"]
+    assert paper.ppo == PpoSettings()
+    assert paper.traits == TraitSettings()
+    assert (paper.mixes, len(paper.seeds), paper.windows) == (P_CONSERVATIVE, 3, 696_000)
+    assert [(trials.conditions, trials.episodes) for trials in paper.trials] == [
+        (tuple(Conditions(p) for p in (0.25, 0.4, 0.6)), 500)
+    ]
+
+
+def test_the_full_budget_compares_all_methods_with_three_seeds_in_other_worlds_too() -> None:
+    full = BUDGETS["full"]
+    assert len(full.seeds) == 3 and full.mixes == (ALL_MIXES,)
+    trained = [method for method in map(find_method, full.methods) if isinstance(method, Learned)]
+    assert {method.encoder for method in trained} - {None} == set(traits.METHODS)
+    conditions = {one for trials in full.trials for one in trials.conditions}
+    assert {one.position_noise_m for one in conditions} > {0.0, 0.1}
+    assert min(one.tau_s for one in conditions) < Idm.tau_s < max(one.tau_s for one in conditions)
+    assert {one.percent for one in conditions} == {25, 50, 100}
+
+
+def test_trait_budgets_are_networks_of_one_kind() -> None:
+    assert set(TRAIT_BUDGETS) == set(BUDGETS)
+    assert TRAIT_BUDGETS["quick"].hidden_size == TRAIT_BUDGETS["full"].hidden_size
+
+
+def test_unknown_budgets_are_answered_with_the_known_ones() -> None:
+    with pytest.raises(InputError, match="unknown budget 'huge'; choose one of: quick, full, paper"):
+        find_budget("huge")
+
+
+@pytest.mark.parametrize(
+    ("conditions", "label"),
+    [
+        (Conditions(0.4), "as trained"),
+        (Conditions(ALL_MIXES), "as trained"),
+        (Conditions(0.4, position_noise_m=0.05), "noise 0.05 m"),
+        (Conditions(0.4, tau_s=1.5), "tau 1.5 s"),
+        (Conditions(0.4, percent=25), "25 % of training"),
+        (Conditions(0.4, 0.1, 0.7, 50), "noise 0.1 m, tau 0.7 s, 50 % of training"),
+    ],
+)
+def test_conditions_are_called_by_what_differs_from_the_training(conditions: Conditions, label: str) -> None:
+    assert conditions.label == label

@@ -1,0 +1,132 @@
+"""What the figures show, and that they are pictures."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from tests.study.scenes import given, trained
+from tint_sumo.study import figures
+from tint_sumo.study.budgets import ALL_MIXES, Conditions
+from tint_sumo.study.evaluation import OUTCOMES
+from tint_sumo.study.figures import plot_bars, plot_curves, plot_worlds
+from tint_sumo.study.methods import METHODS
+from tint_sumo.study.rows import at_mixes, over_all_mixes, tabulate
+
+AS_TRAINED = Conditions(ALL_MIXES)
+WORLDS = (
+    AS_TRAINED,
+    *(Conditions(ALL_MIXES, position_noise_m=noise_m) for noise_m in (0.05, 0.1)),
+    *(Conditions(ALL_MIXES, tau_s=tau_s) for tau_s in (0.7, 1.5)),
+    *(Conditions(ALL_MIXES, percent=percent) for percent in (25, 50)),
+)
+MIXES = tuple(Conditions(p) for p in (0.1, 0.25, 0.4, 0.9))
+ROWS = tabulate(
+    [
+        *(trained("oracle", seed, dict.fromkeys((*MIXES, *WORLDS), (8 + seed, 1, 1 - seed))) for seed in (0, 1)),
+        given("ttc", dict.fromkeys((*MIXES[1:], *WORLDS[:5]), (5, 4, 1))),
+    ]
+)
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[], Figure]:
+    """The figure that was written last."""
+    seen: list[Figure] = []
+    write = figures._write
+
+    def remember(figure: Figure, file: Path) -> Path:
+        seen.append(figure)
+        return write(figure, file)
+
+    monkeypatch.setattr(figures, "_write", remember)
+    return lambda: seen[-1]
+
+
+def curve(*shares: float) -> pd.DataFrame:
+    return pd.DataFrame({"decisions": [64.0 * (1 + step) for step in range(len(shares))], "success": shares})
+
+
+def assert_picture(file: Path) -> None:
+    with Image.open(file) as picture:
+        assert picture.format == "PNG"
+        assert picture.width > 500 and picture.height > 200
+        assert len(picture.convert("L").getcolors()) > 10, "an empty picture"
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
+
+
+def test_bars_have_a_panel_for_each_mix_and_add_up_to_all_cases(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    assert_picture(plot_bars(at_mixes(ROWS), tmp_path / "bars.png"))
+    panels = [axes for axes in drawn().axes if axes.get_visible()]
+    assert [axes.get_title() for axes in panels] == [f"P(conservative) = {p:g}" for p in (0.1, 0.25, 0.4, 0.9)]
+    for axes, methods in zip(panels, (1, 2, 2, 2), strict=True):
+        widths = np.array([bar.get_width() for bar in axes.patches]).reshape(3, methods)
+        np.testing.assert_allclose(widths.sum(axis=0), 100.0)
+        assert widths[0, -1] == pytest.approx(85.0)  # success of the oracle
+    shown = [[label.get_text() for label in axes.get_yticklabels()] for axes in panels]
+    both = ["time to collision", "oracle"]
+    assert shown == [["oracle"], both, [], both], "names are left out where the panel to the left has the same"
+
+
+def test_the_paper_s_success_is_marked_where_there_is_one(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    plot_bars(at_mixes(ROWS), tmp_path / "bars.png")
+    marked = {}
+    for axes in drawn().axes:
+        lines = [line for line in axes.get_lines() if line.get_label() == "success in the paper"]
+        marked[axes.get_title()] = [float(value) for line in lines for value in line.get_xdata() if value > 0.0]
+    assert marked["P(conservative) = 0.25"] == [85.0] and marked["P(conservative) = 0.4"] == [90.0]
+    assert marked["P(conservative) = 0.9"] == []
+    entries = [text.get_text() for text in drawn().legends[0].get_texts()]
+    assert sorted(entries) == sorted([*OUTCOMES, "95 % interval of success", "success in the paper"])
+
+
+def test_a_single_bar_is_a_figure_too(tmp_path: Path) -> None:
+    rows = tabulate([given("always_go", {Conditions(0.4): (0, 0, 3)})])
+    assert_picture(plot_bars(rows, tmp_path / "bars.png"))
+
+
+def test_curves_are_means_over_seeds(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    curves = {"oracle": [curve(0.2, 0.4), curve(0.4, 0.8)], "ma": [curve(0.1, 0.1)]}
+    assert_picture(plot_curves(curves, tmp_path / "curves.png"))
+    axes = drawn().axes[0]
+    oracle, ma = axes.get_lines()
+    assert [line.get_label() for line in (oracle, ma)] == [METHODS["oracle"].title, METHODS["ma"].title]
+    np.testing.assert_allclose(oracle.get_xdata(), [64, 128])
+    np.testing.assert_allclose(oracle.get_ydata(), [30.0, 45.0])  # of 0.2 and 0.4, then smoothed 0.3 and 0.6
+
+
+def test_seeds_are_compared_as_far_as_all_of_them_have_come(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    curves = {"oracle": [curve(0.2, 0.2, 0.2), curve(0.4)]}
+    assert_picture(plot_curves(curves, tmp_path / "curves.png"))
+    np.testing.assert_allclose(drawn().axes[0].get_lines()[0].get_ydata(), [30.0])
+
+
+def test_every_method_has_a_curve_of_its_own_look(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    curves = {name: [curve(0.2, 0.4)] for name in METHODS}
+    assert_picture(plot_curves(curves, tmp_path / "curves.png"))
+    lines = drawn().axes[0].get_lines()
+    assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(METHODS)
+
+
+def test_worlds_have_a_panel_for_each_condition_through_the_training_s_world(
+    tmp_path: Path, drawn: Callable[[], Figure]
+) -> None:
+    assert_picture(plot_worlds(over_all_mixes(ROWS), tmp_path / "worlds.png"))
+    noise, tau, percent = drawn().axes
+    shown = [[list(container.lines[0].get_xdata()) for container in axes.containers] for axes in (noise, tau, percent)]
+    assert shown[0] == [[0.0, 0.05, 0.1]] * 2
+    assert shown[1] == [[0.7, 1.0, 1.5]] * 2
+    assert shown[2] == [[100], [25, 50, 100]], "a rule has no training to be cut short"
+    assert [container.get_label() for container in noise.containers] == ["time to collision", "oracle"]
+
+
+def test_methods_of_the_past_are_drawn_under_their_names(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    rows = tabulate([trained("forgotten", 0, {AS_TRAINED: (1, 1, 0), Conditions(0.4): (1, 1, 0)})])
+    assert_picture(plot_worlds(over_all_mixes(rows), tmp_path / "worlds.png"))
+    assert [container.get_label() for container in drawn().axes[0].containers] == ["forgotten"]
+    plot_bars(at_mixes(rows), tmp_path / "bars.png")
+    assert drawn().axes[0].get_yticklabels()[0].get_text() == "forgotten"

@@ -13,8 +13,10 @@ from tint_sumo.config import PpoSettings, ends
 from tint_sumo.errors import InputError
 from tint_sumo.policy import EncoderTraits, NoTraits
 from tint_sumo.study import loading
+from tint_sumo.study.budgets import ALL_MIXES
 from tint_sumo.study.evaluation import evaluate
 from tint_sumo.study.loading import find_policy, load_policy, shipped_policies
+from tint_sumo.study.methods import METHODS, Learned
 from tint_sumo.study.rules import AlwaysGo, TimeToCollision
 from tint_sumo.study.training import train_policy
 from tint_sumo.traits.storage import save
@@ -168,7 +170,7 @@ def test_a_card_with_a_name_of_the_past(run: Path) -> None:
 def test_a_missing_trait_model(run_with_traits: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tint_sumo.traits.storage.shipped", lambda _: tmp_path / "none")
     (run_with_traits / "traits.safetensors").unlink()
-    assert "no trait model traits" in refused(run_with_traits)
+    assert f"no trait model {run_with_traits / 'traits.safetensors'}" in refused(run_with_traits)
 
 
 def test_another_trait_model_than_the_training_s_is_refused(run_with_traits: Path) -> None:
@@ -260,3 +262,16 @@ def test_the_zip_bomb_is_live(run: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "marker").exists()
     refused(run / "policy.zip", allow_pickle=True)
     assert (tmp_path / "marker").is_dir()
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if isinstance(method, Learned)])
+def test_a_policy_of_every_learned_method_is_shipped(name: str) -> None:
+    contender = load_policy(name)
+    venv = contender.make_venv(2, p_conservative=0.5)
+    try:
+        venv.seed(0)
+        actions, _ = contender.policy.predict(venv.reset(), deterministic=True)
+        assert actions.shape == (2,)
+        assert contender.p_conservative == ALL_MIXES
+    finally:
+        venv.close()

@@ -38,10 +38,10 @@ def plot_bars(rows: Sequence[Row], file: Path) -> Path:
     for position, (axes, (p_conservative, group)) in enumerate(zip(all_axes.flat, panels, strict=False)):
         _plot_panel(axes, group)
         axes.set_title(f"P(conservative) = {p_conservative:g}", fontsize=10)
+        axes.set_xlabel("% of the cases", fontsize=8)
         axes.tick_params(labelbottom=True)
         if position % columns and _titles(group) == _titles(panels[position - 1][1]):
             axes.tick_params(labelleft=False)
-    figure.supxlabel("share of the cases (%)", fontsize=10)
     legends = [axes.get_legend_handles_labels() for axes in all_axes.flat]
     entries = {label: handle for legend in legends for handle, label in zip(*legend, strict=True)}
     figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=5, frameon=False, fontsize=9)
@@ -73,6 +73,7 @@ def _plot_panel(axes: Axes, rows: Sequence[Row]) -> None:
     if not np.isnan(published).all():
         axes.plot(published, [position - 0.44 for position in positions], "kv", ms=4, label="success in the paper")
     axes.set_yticks(list(positions), _titles(rows), fontsize=8)
+    axes.tick_params(axis="x", labelsize=8)
     axes.set_xlim(0, 100)
     axes.invert_yaxis()
     axes.spines[["top", "right"]].set_visible(False)
@@ -90,13 +91,7 @@ def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Pat
     for position, (method, seeds) in enumerate(curves.items()):
         shares = [one.set_index("decisions")["success"].rolling(5, min_periods=1).mean() for one in seeds]
         percent = 100.0 * pd.concat(shares, axis=1).dropna()
-        style: dict[str, Any] = {
-            "color": f"C{position}",
-            "marker": _MARKERS[position % len(_MARKERS)],
-            "markevery": 0.12,
-            "ms": 4,
-            "lw": 1.3,
-        }
+        style = _line_style(position) | {"markevery": 0.12}
         axes.plot(percent.index, percent.mean(axis=1), label=METHODS[method].title, **style)
         axes.fill_between(
             percent.index.to_numpy(), percent.min(axis=1), percent.max(axis=1), color=f"C{position}", alpha=0.12, lw=0
@@ -136,14 +131,13 @@ def _plot_line(axes: Axes, rows: Sequence[Row], name: str, position: int) -> Non
         values = sorted(points)
         percent = np.array([100.0 * points[value].rate("success") for value in values])
         limits = np.array([[100.0 * end for end in points[value].intervals["success"]] for value in values]).T
-        style: dict[str, Any] = {
-            "color": f"C{position}",
-            "marker": _MARKERS[position % len(_MARKERS)],
-            "ms": 4,
-            "lw": 1.2,
-            "capsize": 2,
-        }
+        style = _line_style(position) | {"capsize": 2}
         axes.errorbar(values, percent, yerr=np.abs(limits - percent), label=rows[0].title, **style)
+
+
+def _line_style(position: int) -> dict[str, Any]:
+    """Lines differ in colour and marker."""
+    return {"color": f"C{position}", "marker": _MARKERS[position % len(_MARKERS)], "ms": 4, "lw": 1.2}
 
 
 def _by_method(rows: Sequence[Row]) -> dict[str, list[Row]]:

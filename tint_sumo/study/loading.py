@@ -16,7 +16,7 @@ from tint_sumo.files import shipped
 from tint_sumo.policy import ActionRepeat, RecurrentPPO, TraitObservation, TraitSource
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
 from tint_sumo.study.methods import METHODS, Learned, Policy, Rule, find_learned
-from tint_sumo.study.training import POLICY, digest
+from tint_sumo.study.training import POLICY, TRAITS, digest
 from tint_sumo.traits import TraitModel
 
 DEFAULT_P_CONSERVATIVE = 0.4
@@ -85,9 +85,9 @@ def _contender(stem: Path, policy: Any) -> Contender:
 
 
 def _load_encoder(stem: Path, card: dict[str, Any]) -> TraitModel:
-    """The trait model beside the policy, or the shipped one of that name: the very one it was trained with."""
-    beside = weights_file(stem.with_name(card["traits"]))
-    encoder = traits.load(beside if beside.is_file() else card["traits"], latent_size=LATENT_SIZE)
+    """The trait model that the policy was trained with: the one beside it in a run, or a shipped one by its name."""
+    named = card["traits"]
+    encoder = traits.load(weights_file(stem.with_name(TRAITS)) if named == TRAITS else named, latent_size=LATENT_SIZE)
     if digest(encoder) != card.get("traits_sha256"):
         raise InputError(f"{card_file(stem)} belongs to another trait model {card['traits']}; restore that model")
     return encoder

@@ -397,7 +397,7 @@ class Bench(Command):
     """Measure how fast the environments and the recorder are on this machine, against SUMO's own speed."""
 
     quick: bool = False
-    """Measure less, for a first look; 3 minutes on a free machine otherwise."""
+    """Measure less, for a first look; 2 to 4 minutes on a free machine otherwise."""
 
     def run(self) -> Outcome:
         from tint_sumo.bench import QUICK, Sizes, run_benchmark

@@ -389,7 +389,7 @@ class Intersections:
             return
         get_speed = self._connection.vehicle.getSpeed
         for replica, lane in _where(changed):
-            on_lane = self.present[replica] & (self.lane[replica] == lane)
+            on_lane = self.yields[replica] & (self.lane[replica] == lane)
             if self.has_claimed[replica, lane]:
                 for slot in np.flatnonzero(on_lane).tolist():
                     self._answer_claim(replica, slot, get_speed(self._ids[replica][slot]))

@@ -18,6 +18,11 @@ class Conditions:
     percent: int = 100  # of the training
 
     @property
+    def is_single_mix(self) -> bool:
+        """Whether all cases have one P(conservative), and nothing else differs from the world of the training."""
+        return isinstance(self.p_conservative, float) and self == Conditions(self.p_conservative)
+
+    @property
     def label(self) -> str:
         """What differs from the world of the training, for tables and figures."""
         parts = [

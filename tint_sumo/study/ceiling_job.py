@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, write_json
-from tint_sumo.study.budgets import Conditions, Trials
+from tint_sumo.study.budgets import Trials
 from tint_sumo.study.ceiling import ceiling
 from tint_sumo.study.policy_jobs import CASES
 from tint_sumo.study.progress import Report
@@ -31,7 +31,7 @@ class CeilingJob:
             one.p_conservative: trials.episodes
             for trials in self.trials
             for one in trials.conditions
-            if isinstance(one.p_conservative, float) and one == Conditions(one.p_conservative)
+            if one.is_single_mix and isinstance(one.p_conservative, float)
         }
         found = {}
         for done, (p_conservative, episodes) in enumerate(wanted.items()):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tint_sumo.config import Share
+from tint_sumo.config import Idm, Share, ends
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import OUTCOMES, Evaluation
 from tint_sumo.study.methods import METHODS, Learned
@@ -61,20 +61,24 @@ class Row:
     @property
     def navigation_time_s(self) -> float | None:
         """Mean time of successful episodes; None without any."""
-        return Evaluation(tuple(case for one in self.evaluations for case in one.cases)).navigation_time_s
+        return self._pooled.navigation_time_s
 
     @property
     def collisions(self) -> dict[str, int]:
         """Number of collisions by trait and lane of the driver that was hit, over all seeds."""
-        return Evaluation(tuple(case for one in self.evaluations for case in one.cases)).collisions
+        return self._pooled.collisions
+
+    @property
+    def _pooled(self) -> Evaluation:
+        return Evaluation(tuple(case for one in self.evaluations for case in one.cases))
 
     @property
     def published(self) -> dict[str, float]:
         """The paper's rates in percent, empty where it has none; for its own conditions alone."""
-        p = self.conditions.p_conservative
-        if not isinstance(p, float) or self.conditions != Conditions(p):
+        if not self.conditions.is_single_mix:
             return {}
-        return dict(zip(OUTCOMES, RATES_PERCENT.get((self.method, p), ()), strict=False))
+        low, _ = ends(self.conditions.p_conservative)
+        return dict(zip(OUTCOMES, RATES_PERCENT.get((self.method, low), ()), strict=False))
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -105,7 +109,7 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
         return (
             -conditions.percent,
             conditions.position_noise_m,
-            abs(conditions.tau_s - 1.0),
+            abs(conditions.tau_s - Idm.tau_s),
             conditions.tau_s,
             isinstance(conditions.p_conservative, tuple),
             conditions.p_conservative,
@@ -127,12 +131,7 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
 
 def at_mixes(rows: Sequence[Row]) -> list[Row]:
     """The rows of the main table: fully trained, the default world, one P(conservative) each."""
-    return [
-        row
-        for row in rows
-        if isinstance(row.conditions.p_conservative, float)
-        and row.conditions == Conditions(row.conditions.p_conservative)
-    ]
+    return [row for row in rows if row.conditions.is_single_mix]
 
 
 def over_all_mixes(rows: Sequence[Row]) -> list[Row]:

@@ -15,10 +15,11 @@ import numpy as np
 import torch
 from PIL import Image
 
-from tint_sumo import ENV_ID
+from tint_sumo import ENV_IDS
 from tint_sumo.cli import main as tint_sumo
 from tint_sumo.files import write_json
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
+from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.study.budgets import BUDGETS
 from tint_sumo.study.methods import Learned, find_method
 from tint_sumo.study.policy_jobs import label
@@ -96,7 +97,7 @@ def copy(source: Path, target: Path) -> None:
 
 
 def make_pictures() -> None:
-    env = gymnasium.make(ENV_ID, render_mode="rgb_array")
+    env = gymnasium.make(ENV_IDS[T_INTERSECTION], render_mode="rgb_array")
     env.reset(seed=1)
     for step in range(41):
         env.step(np.int64(2 if step > 5 else 0))

@@ -1,9 +1,12 @@
 """Shared by all tests."""
 
 import os
+from collections.abc import Callable
 
 import pytest
 import torch
+
+from tests.scenes.own_networks import OWN_NETWORKS, OwnNetwork
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -16,3 +19,16 @@ def _one_thread() -> None:
 def _logs_in_a_folder_of_the_tests(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Stable-Baselines3 makes one for every training that is given none."""
     os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
+
+
+@pytest.fixture(scope="session")
+def own_network(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], OwnNetwork]:
+    """Makes a network of one's own by its name, once."""
+    made: dict[str, OwnNetwork] = {}
+
+    def make(name: str) -> OwnNetwork:
+        if name not in made:
+            made[name] = OWN_NETWORKS[name](tmp_path_factory.mktemp(name))
+        return made[name]
+
+    return make

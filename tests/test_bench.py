@@ -10,7 +10,7 @@ from tint_sumo.bench import Sizes, run_benchmark
 from tint_sumo.bench.measuring import Clocks
 from tint_sumo.bench.policies import training_speed
 from tint_sumo.study.budgets import BUDGETS
-from tint_sumo.traits import METHODS
+from tint_sumo.traits import TRAIT_METHODS
 
 TINY_PPO = replace(BUDGETS["full"].ppo, n_envs=4, n_steps=3, n_minibatches=2)
 TINY = Sizes(
@@ -62,7 +62,7 @@ def test_the_benchmark_measures_everything() -> None:
     for key in ("train_decisions_per_s", "recurrent_ppo_decisions_per_s", "train_to_recurrent_ppo", "decision_ms"):
         assert printed[key] > 0.0
     for part in ("train_windows_per_s", "encode_ms"):
-        assert printed[part].keys() == METHODS.keys()
+        assert printed[part].keys() == TRAIT_METHODS.keys()
         assert min(printed[part].values()) > 0.0
     assert printed["windows"] >= 20
     assert printed["peak_rss_mib"] > 50.0  # three Pythons

@@ -56,8 +56,8 @@ def trait_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     settings = TraitSettings(embedding_sizes=(8, 8), hidden_size=8, encoder_output_size=8, decoder_output_size=8)
     folder = tmp_path_factory.mktemp("model")
-    save(traits.METHODS["vae"](settings), folder / "model", {"seed": 0})
-    save(traits.METHODS["vae"](settings, latent_size=3), folder / "wide", {"seed": 0})
+    save(traits.TRAIT_METHODS["vae"](settings), folder / "model", {"seed": 0})
+    save(traits.TRAIT_METHODS["vae"](settings, latent_size=3), folder / "wide", {"seed": 0})
     return folder / "model.safetensors"
 
 
@@ -251,8 +251,10 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     ("argv", "message"),
     [
         ("net --replicas 0 --out OUT", "replicas"),
+        ("net --scene moon --out OUT", "unknown scene 'moon'"),
         ("record --p-conservative 1.5 --out OUT", "p_conservative"),
         ("record --windows 0 --out OUT", "windows"),
+        ("record --scene moon --out OUT", "unknown scene 'moon'; choose one of: "),
         ("record --seed -1 --out OUT", "seed"),
         ("dataset inspect NOWHERE", "dataset"),
         ("traits train --data NOWHERE --out OUT", "dataset"),
@@ -279,10 +281,12 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ("policy train --method oracle --p-conservative 0.1 0.2 0.3 --out OUT", "one probability or two"),
         ("policy train --method streaming --traits MODEL --out OUT", "of a cross_window model, not of vae"),
         ("policy train --method oracle --steps 0 --out OUT", "steps"),
+        ("policy train --method oracle --scene moon --out OUT", "unknown scene 'moon'"),
         ("policy train --method vae --traits nobody --out OUT", "no trait model nobody"),
         ("policy train --method vae --traits WIDE --out OUT", "3 latents where 2 are needed"),
         ("policy evaluate --model nobody", "no policy nobody"),
         ("policy evaluate --model ttc --p-conservative 2", "p_conservative"),
+        ("policy evaluate --model ttc --scene moon", "unknown scene 'moon'"),
         ("policy evaluate --model ttc --noise -1", "position_noise_m"),
         ("policy evaluate --model ttc --tau 0", "tau_s"),
         ("policy evaluate --model ttc --episodes 0", "episodes"),

@@ -62,7 +62,7 @@ def test_importing_the_package_loads_no_more_than_gymnasium() -> None:
 def test_floors_import_downwards_only() -> None:
     floors = [
         "compiling config errors files processes progress",
-        "scenario",
+        "scenes",
         "simulation",
         "envs dataset",
         "traits",

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from tests.terminal import look, open_terminal
-from tint_sumo.progress import make_bar
+from tint_sumo.progress import make_bar, progress_bar
 
 
 def work() -> None:
@@ -33,3 +33,19 @@ def test_on_a_terminal_it_moves(monkeypatch: pytest.MonkeyPatch) -> None:
         shown = look(ours, 10.0)
     os.close(ours)
     assert sum(f"{done}/6" in shown for done in range(7)) > 2  # a busy machine may skip some
+
+
+def test_nothing_is_shown_before_the_first_report(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_bar("work", "step"):
+        pass
+    assert capsys.readouterr().err == ""
+
+
+def test_the_bar_ends_where_the_work_does(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_bar("work", "step") as report:
+        for done in (20, 50, 100):
+            report(done, 100, f"reached {done}")
+    shown = capsys.readouterr().err
+    assert "work:  20%" in shown
+    assert "100/100" in shown
+    assert "reached 100" in shown

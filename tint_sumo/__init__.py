@@ -7,11 +7,28 @@ from gymnasium.envs.registration import register, registry
 
 __version__ = "0.1.0"
 
-ENV_ID = "tint_sumo/TIntersection-v1"
+# Each scene's environment; a version grows when its episodes change.
+ENV_IDS = {
+    "t_intersection": "tint_sumo/TIntersection-v1",
+    "t_intersection_right": "tint_sumo/TIntersectionRight-v0",
+    "four_way": "tint_sumo/FourWay-v0",
+    "four_way_turn": "tint_sumo/FourWayTurn-v0",
+    "roundabout": "tint_sumo/Roundabout-v0",
+    "on_ramp": "tint_sumo/OnRamp-v0",
+}
+SCENE_ENV_ID = "tint_sumo/Scene-v0"  # of any scene, given as ``scene``
 
-if ENV_ID not in registry:
-    register(
-        id=ENV_ID,
-        entry_point="tint_sumo.envs.t_intersection:TIntersectionEnv",
-        vector_entry_point="tint_sumo.envs.vector:TIntersectionVectorEnv",
-    )
+
+def _register(env_id: str, **scene: str) -> None:
+    if env_id not in registry:
+        register(
+            id=env_id,
+            entry_point="tint_sumo.envs.scene_env:SceneEnv",
+            vector_entry_point="tint_sumo.envs.vector:SceneVectorEnv",
+            kwargs=scene,
+        )
+
+
+for _scene, _env_id in ENV_IDS.items():
+    _register(_env_id, scene=_scene)
+_register(SCENE_ENV_ID)

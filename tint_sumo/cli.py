@@ -49,17 +49,20 @@ class Command:
 
 @dataclass(frozen=True, kw_only=True)
 class Net(Command):
-    """Build the road network, the drivers and plain SUMO's configuration with netconvert."""
+    """Build a scene's road network, the drivers and plain SUMO's configuration with netconvert."""
 
+    scene: str = "t_intersection"
+    """Scene: t_intersection, t_intersection_right, four_way, four_way_turn, roundabout or on_ramp."""
     replicas: int = 1
     """Number of intersections in the network."""
     out: Path = Path("sumo_net")
     """Folder for the files; files of the same names are replaced if this command wrote them."""
 
     def run(self) -> Outcome:
-        from tint_sumo.scenario.build import CONFIG_FILE, write_scenario
+        from tint_sumo.scenes import find_scene
+        from tint_sumo.scenes.build import CONFIG_FILE, write_scene
 
-        files = write_scenario(self.out, self.replicas)
+        files = write_scene(self.out, find_scene(self.scene), self.replicas)
         text = f"wrote {len(files)} files to {self.out}; run them with: sumo -c {self.out / CONFIG_FILE}"
         return Outcome(text, {"replicas": self.replicas, "files": [str(file) for file in files]})
 
@@ -80,6 +83,8 @@ class Record(Command):
     """traits: conservative and aggressive drivers; continuous: desired speeds and gaps without classes."""
     seed: int = 0
     """Seed of the traffic."""
+    scene: str = "t_intersection"
+    """Scene: t_intersection, t_intersection_right, four_way, four_way_turn, roundabout or on_ramp."""
     workers: int = 1
     """Processes that simulate; the dataset does not depend on their number."""
     format: Literal["parquet", "fcd"] = "parquet"
@@ -94,6 +99,7 @@ class Record(Command):
             p_conservative=_share(self.p_conservative),
             population=self.population,
             seed=self.seed,
+            scene=self.scene,
             workers=self.workers,
             fcd=self.format == "fcd",
         )
@@ -162,12 +168,14 @@ class EvaluateTraits(Command):
     """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
     noise: float = 0.0
     """Standard deviation of the noise on every position, m."""
+    other_scene: bool = False
+    """Take a model that was trained in another scene, too."""
 
     def run(self) -> Outcome:
         from tint_sumo.study.trait_models import evaluate_traits
 
         _use_one_thread()
-        found = evaluate_traits(self.data, self.model, noise_m=self.noise)
+        found = evaluate_traits(self.data, self.model, noise_m=self.noise, other_scene=self.other_scene)
         parts = {**found["by_length"], **found["by_leader"]}
         lines = [
             f"linear SVC         {found['accuracy']:8.3%} of {found['windows']} windows",
@@ -195,12 +203,14 @@ class PlotTraits(Command):
     """Folder for the PNG files."""
     noise: float = 0.0
     """Standard deviation of the noise on every position, m."""
+    other_scene: bool = False
+    """Take a model that was trained in another scene, too."""
 
     def run(self) -> Outcome:
         from tint_sumo.study.trait_models import plot_traits
 
         _use_one_thread()
-        files = plot_traits(self.data, self.model, self.out, noise_m=self.noise)
+        files = plot_traits(self.data, self.model, self.out, noise_m=self.noise, other_scene=self.other_scene)
         return Outcome("\n".join(f"wrote {file}" for file in files), {"files": [str(file) for file in files]})
 
 
@@ -271,6 +281,8 @@ class TrainPolicy(Command):
     """Seed of the training, 0 to 1000."""
     budget: BudgetName = "full"
     """Sizes of the network, settings of PPO and number of decisions. full takes 5 to 8 minutes on a free core."""
+    scene: str = "t_intersection"
+    """Scene: t_intersection, t_intersection_right, four_way, four_way_turn, roundabout or on_ramp."""
     traits: str | None = None
     """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file; the
     shipped one of the method if not given."""
@@ -278,8 +290,8 @@ class TrainPolicy(Command):
     """Write the policy as Stable-Baselines3's policy.zip, too. That is a pickle: others must trust you to read it."""
 
     def run(self) -> Outcome:
+        from tint_sumo.progress import progress_bar
         from tint_sumo.study.budgets import find_budget
-        from tint_sumo.study.progress import progress_bar
         from tint_sumo.study.training import train_policy
 
         _use_one_thread()
@@ -293,6 +305,7 @@ class TrainPolicy(Command):
                 self.seed,
                 self.out,
                 settings=settings,
+                scene=self.scene,
                 traits=self.traits,
                 with_zip=self.zip,
                 report=report,
@@ -311,6 +324,8 @@ class EvaluatePolicy(Command):
     p_conservative: ShareFlag | None = None
     """Probability that a driver is conservative, 0 to 1, or two numbers between which each case draws its own; those
     of the policy's training if not given."""
+    scene: str | None = None
+    """Scene; the one the policy was trained in if not given, for always_go and ttc t_intersection."""
     noise: float = 0.0
     """Standard deviation of the noise on the others' positions, m."""
     tau: float = 1.0
@@ -323,12 +338,13 @@ class EvaluatePolicy(Command):
     """Read .zip files, which can run any code: only for files you trust."""
 
     def run(self) -> Outcome:
-        from tint_sumo.study.evaluation import OUTCOMES, evaluate
+        from tint_sumo.envs.rows import OUTCOMES
+        from tint_sumo.progress import progress_bar
+        from tint_sumo.study.evaluation import evaluate
         from tint_sumo.study.loading import load_policy
-        from tint_sumo.study.progress import progress_bar
 
         _use_one_thread()
-        contender = load_policy(self.model, allow_pickle=self.allow_pickle)
+        contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
         p_conservative = contender.p_conservative if self.p_conservative is None else _share(self.p_conservative)
         world = {"p_conservative": p_conservative, "position_noise_m": self.noise, "tau_s": self.tau}
         with progress_bar(self.model, "case") as report:
@@ -346,7 +362,7 @@ class EvaluatePolicy(Command):
         ]
         time_s = evaluation.navigation_time_s
         lines.append("no success" if time_s is None else f"navigation time {time_s:.1f} s")
-        content = {"model": self.model, **world, "seed": self.seed, **evaluation.summary()}
+        content = {"model": self.model, "scene": contender.scene, **world, "seed": self.seed, **evaluation.summary()}
         return Outcome("\n".join(lines), content)
 
 
@@ -390,6 +406,26 @@ class ReportStudy(Command):
         from tint_sumo.study.report import write_report
 
         return _report_outcome(write_report(self.out))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyScenes(Command):
+    """Test trait models in scenes they were not trained in, half an hour's work; the same command resumes it."""
+
+    after_interrupt: ClassVar[str] = RESUMES
+
+    out: Path = Path("runs/scenes")
+    """Folder of the comparison."""
+    workers: int = 2
+    """Processes at a time."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.scene_study import SceneStudy, report_markdown, run_scene_study
+
+        table = run_scene_study(SceneStudy(), self.out, workers=self.workers)
+        files = [str(self.out / "scenes.csv"), str(self.out / "scenes.md")]
+        text = "\n".join([report_markdown(table), *(f"wrote {file}" for file in files)])
+        return Outcome(text, {"results": table.to_dict("records"), "files": files})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -438,7 +474,11 @@ class Policy:
 class Study:
     """The study end to end."""
 
-    command: Annotated[RunStudy, subcommand("run")] | Annotated[ReportStudy, subcommand("report")]
+    command: (
+        Annotated[RunStudy, subcommand("run")]
+        | Annotated[ReportStudy, subcommand("report")]
+        | Annotated[StudyScenes, subcommand("scenes")]
+    )
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,9 @@ from typing import Literal
 
 from tint_sumo.errors import InputError
 
-MAX_VEHICLES = 12  # surrounding vehicles on the street and in an observation (code)
+NO_LEADER_GAP_M = 20.0  # stands for the gap of every driver without a leader, whatever its trait, and caps all gaps
+MIN_WINDOW_STEPS = 2  # of a window; a single step has no motion
+STEP_S = 0.1  # of simulations, and between the states of a window (code)
 WINDOW_STEPS = 20  # steps from which a trait is inferred, and between two inferences (paper III-C, code)
 LATENT_SIZE = 2  # numbers that represent a trait (paper III-B)
 P_CONSERVATIVE = (0.25, 0.4, 0.6)  # driver mixes of the paper's experiments (paper Fig. 4)
@@ -20,23 +22,6 @@ SPEED_SCALE_MPS = 3.0  # velocities are observed divided by this: the ego's top 
 
 Backend = Literal["auto", "libsumo", "traci"]
 Share = float | tuple[float, float]  # a probability, or the range it is drawn from
-
-
-@dataclass(frozen=True)
-class Street:
-    """The T-intersection in its own frame: x east, y north, origin where the stem meets the lower lane's edge.
-
-    The lower lane runs west at ``lower_y_m``, the upper lane east at ``upper_y_m``; traffic keeps left.
-    """
-
-    half_length_m: float = 20.0  # vehicle centres lie in [-20, 20] (code)
-    lane_width_m: float = 4.0  # code
-    lower_y_m: float = 2.0
-    upper_y_m: float = 6.0
-    junction_half_length_m: float = 6.0
-    turn_radius_m: float = 6.0  # the ego's quarter circle from (0, 0) to (6, 6) (code)
-    stem_length_m: float = 20.0
-    speed_limit_mps: float = 10.0  # above every desired speed, so that it never binds
 
 
 @dataclass(frozen=True)
@@ -55,6 +40,7 @@ class DriverProfile:
     entry_gap_m: tuple[float, float]  # bumper gap behind the leader at placement and entry, uniform (code)
     yields: bool  # whether the driver reacts to an ego that claims its lane (paper IV-A)
     colour: str  # of the vehicle in figures and in sumo-gui, "r,g,b"
+    weight: float = 1.0  # share among the profiles that yield as this one does, to the accuracy of whole vTypes
 
     @property
     def rgb(self) -> tuple[float, float, float]:
@@ -85,7 +71,7 @@ class Population:
     """The vTypes drivers are drawn from."""
 
     profiles: tuple[DriverProfile, ...] = DRIVER_PROFILES
-    members: int = 32  # vTypes per profile, each with its own draws
+    members: int = 32  # vTypes of a profile of weight 1, each with its own draws
     seed: int = 2022  # of the draws
     idm: Idm = Idm()
 
@@ -150,6 +136,7 @@ class EgoController:
     unsafe_distance_m: float = 0.8  # between vehicle boxes
     closing_distance_m: float = 1.0  # unsafe if also closing faster than closing_speed_mps
     closing_speed_mps: float = 1.0
+    watches_behind: bool = True  # whether vehicles behind the ego count, too (code)
     braking_gain_per_s: float = 5.0
     braking_limit_mps2: float = 6.0
 
@@ -165,8 +152,9 @@ class Claim:
     wait for ever.
     """
 
+    by: Literal["front", "box"] = "front"  # of the ego, that enters the lane; the front's middle is the code's
     approach_speed_mps: float = 0.5  # speed towards the lane that counts as moving in
-    path_margin_m: float = 1.0  # front this far past the lane's border stands in the vehicles' path
+    path_margin_m: float = 1.0  # this far past a lane's border it stands in the vehicles' path
     courtesy_gap_m: float = 1.5  # that yielding drivers add to their minGap while their lane is claimed
     reaction_time_s: float = 0.1  # before a driver brakes: a step
     braking_mps2: float = 6.0  # that a driver is ready for: hard, but below the 9 m/s2 of an emergency
@@ -174,14 +162,6 @@ class Claim:
     def stopping_distance_m(self, speed_mps: float) -> float:
         """Distance in which a driver at this speed is ready to stop."""
         return speed_mps * self.reaction_time_s + speed_mps**2 / (2.0 * self.braking_mps2)
-
-
-@dataclass(frozen=True)
-class EpisodeRules:
-    step_s: float = 0.1  # code
-    time_limit_s: float = 50.0  # code
-    ego_start_y_m: float = -5.0  # of the ego's centre, at x = 0 (code)
-    goal_x_m: float = 8.0  # success when the centre is past it, on the upper lane (code)
 
 
 @dataclass(frozen=True)
@@ -196,19 +176,6 @@ REWARD_PRESETS = {
     "paper": RewardPreset(2.5, -2.0, 0.05, -0.0013),  # paper IV-A
     "authors": RewardPreset(2.5, -2.0, 0.05 / 3.0, -0.013),  # code
 }
-
-
-@dataclass(frozen=True)
-class Scenario:
-    """All that defines a simulated episode, apart from its seed."""
-
-    traffic: Traffic = Traffic()
-    population: Population = Population()
-    street: Street = Street()
-    vehicle: VehicleShape = VehicleShape()
-    ego: EgoController = EgoController()
-    claim: Claim = Claim()
-    episode: EpisodeRules = EpisodeRules()
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,13 @@ import sumolib
 from sumolib.geomhelper import positionAtShapeOffset
 
 from tests.dataset.test_recorder import WINDOWS, contents
+from tests.simulation.scenes import T
 from tint_sumo.dataset.fcd import EPISODE_PERIOD_S, VEHICLE_TYPE, write_fcd
 from tint_sumo.dataset.recorder import record, simulate_episodes
 from tint_sumo.dataset.schema import FCD, TRAJECTORIES
 from tint_sumo.files import shipped
-from tint_sumo.simulation.intersections import Intersections
+from tint_sumo.scenes.layout import layout
+from tint_sumo.simulation.simulation import Simulation
 
 EPISODES = (5, 6)
 NUMBERS = ["x", "y", "angle", "speed", "pos", "slope", "acceleration"]
@@ -43,7 +45,7 @@ def rows(dataset: Path) -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def file(rows: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("fcd") / "shard-00000.xml.gz"
-    write_fcd(rows, path)
+    write_fcd(rows, path, layout(T))
     return path
 
 
@@ -58,11 +60,12 @@ def test_it_tells_what_the_rows_tell(found: pd.DataFrame, rows: pd.DataFrame) ->
     both["time_s"] = (found["time"] - EPISODE_PERIOD_S * both["episode"]).round(1)
     both = both.merge(rows.assign(time_s=rows["time_s"].astype(float).round(1)), on=["episode", "vehicle", "time_s"])
     assert len(both) == len(found) == len(rows)
-    assert (both["direction"] * (both["position_m"] - 22.5) - both["x"]).abs().max() < ROUNDING
+    direction = both["route"].map({"lower": -1, "upper": 1}).astype(int)
+    assert (direction * (both["position_m"] - 22.5) - both["x"]).abs().max() < ROUNDING
     assert (both["speed_mps"] - both["speed"]).abs().max() < ROUNDING
     assert (both["acceleration_mps2"].fillna(0.0) - both["acceleration"]).abs().max() < ROUNDING
-    assert both["y"].equals(both["lane_x"].str.contains("lower|L").map({True: 2.0, False: 6.0}))
-    assert both["angle"].equals(both["direction"].map({-1: 270.0, 1: 90.0}))
+    assert both["y"].equals(both["lane"].str.contains("lower|L").map({True: 2.0, False: 6.0}))
+    assert both["angle"].equals(direction.map({-1: 270.0, 1: 90.0}))
 
 
 def test_time_increases_and_episodes_start_at_full_minutes(found: pd.DataFrame) -> None:
@@ -94,7 +97,7 @@ def test_nothing_tells_the_trait(found: pd.DataFrame, file: Path) -> None:
 
 def test_the_same_rows_give_the_same_bytes(file: Path, rows: pd.DataFrame, tmp_path: Path) -> None:
     again = tmp_path / "other name.xml.gz"
-    write_fcd(rows, again)
+    write_fcd(rows, again, layout(T))
     assert again.read_bytes() == file.read_bytes()
 
 
@@ -106,11 +109,11 @@ def test_sumo_writes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     start, theirs_file = libsumo.start, tmp_path / "sumo.xml"
     options = ["--fcd-output", str(theirs_file), "--fcd-output.acceleration", "true"]
     monkeypatch.setattr(libsumo, "start", lambda command: start([*command, *options]))
-    simulation = Intersections(1, with_ego=False, backend="libsumo")
+    simulation = Simulation(1, T, with_ego=False, backend="libsumo")
     rows, _ = simulate_episodes(simulation, seed=3, first_episode=0, steps=200)
     simulation.close()
     kept = rows.astype(dict.fromkeys(["time_s", "position_m", "speed_mps", "acceleration_mps2"], np.float32))
-    write_fcd(kept, tmp_path / "ours.xml.gz")
+    write_fcd(kept, tmp_path / "ours.xml.gz", layout(T))
     ours, theirs = vehicles(tmp_path / "ours.xml.gz"), vehicles(theirs_file)
     assert list(ours) == list(theirs)
     ours = ours[ours.duplicated("id")]
@@ -133,5 +136,6 @@ def test_a_finished_dataset_gets_it_without_simulating(
     monkeypatch.delattr("tint_sumo.dataset.recorder.simulate_episodes")
     record(copy, WINDOWS, seed=1, fcd=True, progress=False)
     assert contents(dataset).items() < contents(copy).items()
-    write_fcd(pd.read_parquet(next((dataset / TRAJECTORIES).iterdir())), tmp_path / "expected.xml.gz")
+    rows = pd.read_parquet(next((dataset / TRAJECTORIES).iterdir()))
+    write_fcd(rows, tmp_path / "expected.xml.gz", layout(T))
     assert contents(copy)[f"{FCD}/shard-00000.xml.gz"] == (tmp_path / "expected.xml.gz").read_bytes()

@@ -2,16 +2,18 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from tests.simulation.scenes import T
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
 from tint_sumo.dataset.recorder import EPISODE_STEPS, EPISODES_PER_SHARD, record, simulate_episodes
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES
 from tint_sumo.errors import InputError
-from tint_sumo.simulation.intersections import Intersections
+from tint_sumo.simulation.simulation import Simulation
 
 WINDOWS = 3000  # one shard
 TWO_SHARDS = 5000
@@ -38,22 +40,22 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_rows_are_what_sumo_reports() -> None:
-    simulation = Intersections(2, with_ego=False)
+    simulation = Simulation(2, T, with_ego=False)
     try:
         for replica in range(2):
             simulation.reset(replica, [0, replica])
         reported = []
-        vehicle = simulation._connection.vehicle
+        vehicle = simulation.link.connection.vehicle
         for step in range(1, 81):
             simulation.step()
-            for replica, slot in np.argwhere(simulation.present):
-                vehicle_id = simulation._ids[replica][slot]
+            for replica, slot in np.argwhere(simulation.slots.present):
+                vehicle_id = simulation.link.ids[replica][slot]
                 leader = vehicle.getLeader(vehicle_id, 100.0)
-                min_gap_m = simulation.population[simulation.member[replica, slot]].min_gap_m
+                min_gap_m = simulation.population[simulation.slots.member[replica, slot]].min_gap_m
                 reported.append(
                     {
                         "episode": replica,
-                        "vehicle": simulation.vehicle_number[replica, slot],
+                        "vehicle": simulation.slots.vehicle_number[replica, slot],
                         "time_s": round(step * 0.1, 1),
                         "speed": vehicle.getSpeed(vehicle_id),
                         "acceleration": vehicle.getAcceleration(vehicle_id),
@@ -82,7 +84,7 @@ def test_the_tables_are_complete_and_sensible(dataset: Path) -> None:
     drivers = pd.read_parquet(dataset / DRIVERS)
     assert rows["episode"].nunique() == EPISODES_PER_SHARD
     assert rows["time_s"].max() == pytest.approx(EPISODE_STEPS * 0.1)
-    assert set(zip(rows["lane"], rows["direction"], strict=True)) == {("lower", -1), ("upper", 1)}
+    assert set(rows["route"]) == {"lower", "upper"}
     assert rows["position_m"].between(5.0, 45.0).all()
     assert rows["speed_mps"].between(0.0, 3.0 + 1e-6).all()
     assert (rows["gap_m"].dropna() > 0.3).all()
@@ -113,8 +115,7 @@ def test_pandas_reads_a_folder_as_one_table(two_shards: Path) -> None:
         "episode": "int32",
         "vehicle": "int16",
         "time_s": "float32",
-        "lane": "category",
-        "direction": "int8",
+        "route": "category",
         "position_m": "float32",
         "speed_mps": "float32",
         "acceleration_mps2": "float32",
@@ -161,17 +162,18 @@ def test_recording_again_leaves_a_finished_dataset_alone(dataset: Path) -> None:
         ({"windows": 10, "p_conservative": 2.0}, r"must be a probability in \[0, 1\]"),
         ({"windows": 10, "workers": 0}, "workers must be at least 1"),
         ({"windows": 10, "seed": -1}, "seed must not be negative"),
+        ({"windows": 10, "scene": "moon"}, "unknown scene 'moon'"),
     ],
 )
-def test_bad_arguments_write_nothing(tmp_path: Path, arguments: dict[str, float], message: str) -> None:
+def test_bad_arguments_write_nothing(tmp_path: Path, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        record(tmp_path / "d", **arguments)  # type: ignore[arg-type]
+        record(tmp_path / "d", **arguments)
     assert not (tmp_path / "d").exists()
 
 
 def test_libsumo_is_free_again_after_recording(tmp_path: Path) -> None:
     record(tmp_path / "d", 10, progress=False)
-    simulation = Intersections(1, backend="libsumo")
+    simulation = Simulation(1, T, backend="libsumo")
     simulation.close()
 
 

@@ -8,12 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
-from tint_sumo.dataset.recorder import _leaders, record, simulate_episodes
-from tint_sumo.dataset.schema import DRIVERS, MANIFEST, NO_LEADER_GAP_M, TRAJECTORIES, TRAJECTORY_SCHEMA
+from tests.simulation.scenes import T
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, NO_LEADER_GAP_M
+from tint_sumo.dataset.recorder import record, simulate_episodes
+from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, TRAJECTORY_SCHEMA
 from tint_sumo.dataset.windows import Windows, cut_windows, load_labels, load_windows, split_by_episode
 from tint_sumo.errors import InputError
-from tint_sumo.simulation.intersections import Intersections, PlacedVehicle
+from tint_sumo.simulation.demand import PlacedVehicle
+from tint_sumo.simulation.simulation import Simulation
 
 NAN = np.nan
 
@@ -90,24 +92,22 @@ def test_drivers_that_move_alike_look_alike_whatever_their_trait() -> None:
     """Two vehicles held to one speed give the same inputs, gaps and their stand-in included, for either trait."""
     found = []
     for profile in (CONSERVATIVE, AGGRESSIVE):
-        simulation = Intersections(1, with_ego=False)
+        simulation = Simulation(1, T, with_ego=False)
         member = next(i for i, one in enumerate(simulation.population) if one.profile is profile)
         simulation.reset_to(0, [PlacedVehicle(1, 20.0, member), PlacedVehicle(1, 10.0, member)])
-        for vehicle_id in simulation._ids[0][:2]:
-            simulation._connection.vehicle.setSpeedMode(vehicle_id, 32)
-            simulation._connection.vehicle.setSpeed(vehicle_id, 1.5)
-        front_m, number, lane = [], [], []
-        for _ in range(20):
+        for vehicle_id in simulation.link.ids[0][:2]:
+            simulation.link.connection.vehicle.setSpeedMode(vehicle_id, 32)
+            simulation.link.connection.vehicle.setSpeed(vehicle_id, 1.5)
+        front_m, gap_m = np.empty((20, 2)), np.empty((20, 2))
+        for step in range(20):
             simulation.step()
-            front_m.append(simulation.front_m.copy())
-            number.append(simulation.vehicle_number.copy())
-            lane.append(simulation.lane.copy())
+            front_m[step] = simulation.slots.front_m[0, :2]
+            gap_m[step] = simulation.leaders()[1][0, :2]
         simulation.close()
-        _, gap_m = _leaders(np.array(front_m), np.array(number), np.array(lane), length_m=5.0)
-        assert np.isnan(gap_m[:, 0, 0]).all()  # the one ahead
-        np.testing.assert_allclose(gap_m[:, 0, 1], 5.0, atol=1e-9)  # the one behind
+        assert np.isnan(gap_m[:, 0]).all()  # the one ahead
+        np.testing.assert_allclose(gap_m[:, 1], 5.0, atol=1e-9)  # the one behind
         driver = np.repeat([0, 1], 20)
-        tracks = [np.array(values)[:, 0, :2].T.ravel() for values in (front_m, gap_m)]
+        tracks = [values.T.ravel() for values in (front_m, gap_m)]
         found.append(cut_windows(driver, np.zeros(40, int), *tracks).states)
     np.testing.assert_array_equal(found[0], found[1])
 
@@ -137,7 +137,7 @@ def test_another_schema_version(dataset: Path, tmp_path: Path) -> None:
     shutil.copytree(dataset, tmp_path / "d")
     manifest = json.loads((tmp_path / "d" / MANIFEST).read_text())
     (tmp_path / "d" / MANIFEST).write_text(json.dumps(manifest | {"schema_version": 0}))
-    with pytest.raises(InputError, match="schema version 0, this tint_sumo reads 1; record it anew"):
+    with pytest.raises(InputError, match="schema version 0, this tint_sumo reads 2; record it anew"):
         load_windows(tmp_path / "d")
 
 
@@ -189,7 +189,7 @@ def test_labels_of_other_windows(dataset: Path) -> None:
 
 
 def test_simulating_twice_gives_the_same_rows() -> None:
-    simulation = Intersections(2, with_ego=False)
+    simulation = Simulation(2, T, with_ego=False)
     first, second = (simulate_episodes(simulation, seed=4, first_episode=6, steps=40) for _ in range(2))
     simulation.close()
     pd.testing.assert_frame_equal(first[0], second[0])

@@ -14,19 +14,23 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.vec_env import VecMonitor
 
-from tint_sumo import ENV_ID
+from tests.simulation.scenes import LOWER
+from tint_sumo import ENV_IDS
 from tint_sumo.config import REWARD_PRESETS
-from tint_sumo.envs.sb3 import TIntersectionVecEnv
-from tint_sumo.envs.t_intersection import TIntersectionEnv
-from tint_sumo.envs.vector import TIntersectionVectorEnv
+from tint_sumo.envs.rows import TRACKS
+from tint_sumo.envs.sb3 import SceneVecEnv
+from tint_sumo.envs.scene_env import SceneEnv
+from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.errors import InputError
+from tint_sumo.scenes import T_INTERSECTION
 
+ENV_ID = ENV_IDS[T_INTERSECTION]
 GO, STOP = 2, 0
 
 
 @pytest.fixture
-def env() -> Iterator[TIntersectionEnv]:
-    env = TIntersectionEnv()
+def env() -> Iterator[SceneEnv]:
+    env = SceneEnv()
     yield env
     env.close()
 
@@ -83,7 +87,7 @@ def test_headways_are_those_asked_for() -> None:
     """Drivers that keep a longer headway need longer for the street."""
     shares = []
     for tau_s in (0.5, 2.5):
-        vector = TIntersectionVectorEnv(8, tau_s=tau_s)
+        vector = SceneVectorEnv(8, tau_s=tau_s)
         vector.reset(seed=0)
         for _ in range(150):
             observation, *_ = vector.step(np.zeros(8, np.int64))
@@ -92,7 +96,7 @@ def test_headways_are_those_asked_for() -> None:
     assert shares[0] > 1.15 * shares[1]
 
 
-def test_gymnasiums_checker(env: TIntersectionEnv) -> None:
+def test_gymnasiums_checker(env: SceneEnv) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*not been wrapped.*|.*spec is None.*|.*env.spec.*")
@@ -100,18 +104,18 @@ def test_gymnasiums_checker(env: TIntersectionEnv) -> None:
 
 
 def test_gymnasiums_checker_with_rendering() -> None:
-    env = gymnasium.make(ENV_ID, render_mode="rgb_array")
+    env = gymnasium.make(ENV_ID, render_mode="rgb_array", tracks=True)
     check_env(env.unwrapped)
     env.close()
 
 
-def test_stable_baselines3s_checker(env: TIntersectionEnv) -> None:
+def test_stable_baselines3s_checker(env: SceneEnv) -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*unconventional shape.*")  # (12, 2): a set of vehicles
         check_env_sb3(env)
 
 
-def test_one_seed_gives_one_history(env: TIntersectionEnv) -> None:
+def test_one_seed_gives_one_history(env: SceneEnv) -> None:
     first = play(env, seed=3)
     for a, b in zip(first, play(env, seed=3), strict=True):
         assert_equal(a, b)
@@ -121,9 +125,10 @@ def test_one_seed_gives_one_history(env: TIntersectionEnv) -> None:
 
 
 @pytest.mark.parametrize("num_envs", [3, 10])
-def test_each_environment_of_a_batch_lives_like_a_single_one(env: TIntersectionEnv, num_envs: int) -> None:
-    vector = TIntersectionVectorEnv(num_envs, time_limit_s=8.0, position_noise_m=0.1)
-    single = TIntersectionEnv(time_limit_s=8.0, position_noise_m=0.1)
+def test_each_environment_of_a_batch_lives_like_a_single_one(env: SceneEnv, num_envs: int) -> None:
+    settings: dict[str, Any] = {"time_limit_s": 8.0, "position_noise_m": 0.1, "tracks": True}
+    vector = SceneVectorEnv(num_envs, **settings)
+    single = SceneEnv(**settings)
     try:
         observations, infos = vector.reset(seed=20)
         observation, info = single.reset(seed=22)
@@ -131,7 +136,8 @@ def test_each_environment_of_a_batch_lives_like_a_single_one(env: TIntersectionE
         ended = 0
         for _ in range(250):
             assert_equal(observation, {key: value[2] for key, value in observations.items()})
-            assert_equal(info["traits"], infos["traits"][2])
+            for key in ("traits", *TRACKS):
+                assert_equal(info[key], infos[key][2])
             actions = rng.integers(3, size=num_envs)
             observations, rewards, terminated, truncated, infos = vector.step(actions)
             observation, reward, end, cut, info = single.step(actions[2])
@@ -147,41 +153,68 @@ def test_each_environment_of_a_batch_lives_like_a_single_one(env: TIntersectionE
         single.close()
 
 
-def test_the_observation_is_what_the_table_says(env: TIntersectionEnv) -> None:
+def test_the_observation_is_what_the_table_says(env: SceneEnv) -> None:
     observation, info = env.reset(seed=0)
     simulation = env._episodes.simulation
     assert observation["ego"] == pytest.approx([0.0, -5.0 / 20.0, 0.0, 0.0])
     for _ in range(30):
         observation, *_, info = env.step(np.int64(GO))
-    speed = simulation.ego_speed_mps[0] / 3.0
-    pose = simulation.ego_pose[0]
+    speed = simulation.egos.speed_mps[0] / 3.0
+    pose = simulation.egos.pose[0]
     heading = np.array([pose["heading_x"], pose["heading_y"]])
     assert observation["ego"][:2] * 20.0 == pytest.approx([pose["x_m"], pose["y_m"]], abs=1e-5)
     assert observation["ego"][2:] == pytest.approx(speed * heading, abs=1e-6)
     slots = np.flatnonzero(observation["mask"])
     for slot in slots:
         seen = observation["vehicles"][slot] * 20.0 + observation["ego"][:2] * 20.0
-        assert seen == pytest.approx([simulation.x_m[0, slot], simulation.y_m[0, slot]], abs=1e-4)
-        assert info["traits"][slot] == (1 if simulation.yields[0, slot] else -1)
+        assert seen == pytest.approx([simulation.slots.x_m[0, slot], simulation.slots.y_m[0, slot]], abs=1e-4)
+        assert info["traits"][slot] == (0 if simulation.yielding.yields[0, slot] else 1)
     empty = observation["mask"] == 0.0
     assert not observation["vehicles"][empty].any()
-    assert not info["traits"][empty].any()
+    assert (info["traits"][empty] == -1).all()
     assert len(slots) >= 6
 
 
+def test_where_the_vehicles_are_seen_on_their_routes_is_told_if_asked_for(env: SceneEnv) -> None:
+    """The ego has passed the lower lane once its centre is beyond the border at y = 4 m, and the upper one never."""
+    assert not set(TRACKS) & env.reset(seed=5)[1].keys()
+    env = SceneEnv(tracks=True, backend="traci")
+    env.reset(seed=5)
+    simulation, passed = env._episodes.simulation, []
+    while True:
+        observation, _, terminated, truncated, info = env.step(np.int64(GO))
+        present, route = simulation.slots.present[0], simulation.slots.route[0]
+        assert_equal(info["position_m"], np.where(present, simulation.slots.front_m[0], 0.0))
+        (leader,), (gap_m,) = simulation.leaders()
+        assert_equal(info["gap_m"], np.where(leader >= 0, gap_m, np.inf))
+        passed.append(observation["ego"][1] * 20.0 > 4.0)
+        assert_equal(info["passed"], present & (route == LOWER) & passed[-1])
+        if terminated or truncated:
+            break
+    env.close()
+    assert info["outcome"] == "success"
+    assert not passed[0] and passed[-1]
+
+
 def test_position_noise_has_its_standard_deviation_and_spares_the_ego() -> None:
-    clear, noisy = TIntersectionEnv(), TIntersectionEnv(position_noise_m=0.2, backend="traci")
+    clear, noisy = SceneEnv(tracks=True), SceneEnv(tracks=True, position_noise_m=0.2, backend="traci")
     try:
         clear.reset(seed=1)
         noisy.reset(seed=1)
         errors = []
         for _ in range(100):
-            exact, measured = clear.step(np.int64(STOP))[0], noisy.step(np.int64(STOP))[0]
+            (exact, *_, known), (measured, *_, seen) = clear.step(np.int64(STOP)), noisy.step(np.int64(STOP))
             assert_equal(exact["ego"], measured["ego"])
             assert_equal(exact["mask"], measured["mask"])
             real = exact["mask"] == 1.0
-            errors.append((measured["vehicles"] - exact["vehicles"])[real] * 20.0)
+            error_m = (measured["vehicles"] - exact["vehicles"]) * 20.0
+            errors.append(error_m[real])
             assert not measured["vehicles"][~real].any()
+            along_m = np.where(clear._episodes.simulation.slots.route[0] == LOWER, -1.0, 1.0) * error_m[:, 0]
+            np.testing.assert_allclose(seen["position_m"] - known["position_m"], along_m, atol=1e-5)
+            (leader,), _ = clear._episodes.simulation.leaders()
+            gap_error_m = np.where(leader >= 0, along_m[leader] - along_m, 0.0)
+            np.testing.assert_allclose(seen["gap_m"], known["gap_m"] + gap_error_m, atol=1e-5)
         error = np.concatenate(errors)
         assert error.std() == pytest.approx(0.2, rel=0.1)
         assert abs(error.mean()) < 0.02
@@ -192,7 +225,7 @@ def test_position_noise_has_its_standard_deviation_and_spares_the_ego() -> None:
 
 @pytest.mark.parametrize("preset", ["paper", "authors"])
 def test_rewards_and_outcomes(preset: str) -> None:
-    env = TIntersectionEnv(p_conservative=0.6, reward=preset, time_limit_s=15.0)
+    env = SceneEnv(p_conservative=0.6, reward=preset, time_limit_s=15.0)
     numbers = REWARD_PRESETS[preset]
     outcomes = set()
     try:
@@ -203,7 +236,7 @@ def test_rewards_and_outcomes(preset: str) -> None:
                 _, reward, terminated, truncated, info = env.step(np.int64(STOP if seed == 0 else GO))
                 terms = info["reward_terms"]
                 assert reward == pytest.approx(sum(terms.values()))
-                speed_mps = env._episodes.simulation.ego_speed_mps[0]
+                speed_mps = env._episodes.simulation.egos.speed_mps[0]
                 expected = {
                     "success": numbers.goal,
                     "collision": numbers.collision,
@@ -215,7 +248,7 @@ def test_rewards_and_outcomes(preset: str) -> None:
             assert truncated is (outcome == "timeout")
             assert ("collision" in info) is (outcome == "collision")
             if outcome == "success":
-                assert env._episodes.simulation.ego_pose["x_m"][0] > 8.0
+                assert env._episodes.simulation.egos.pose["x_m"][0] > 8.0
             if outcome == "timeout":
                 assert info["time_s"] == pytest.approx(15.0)
         assert outcomes == {"success", "collision", "timeout"}
@@ -243,7 +276,7 @@ def test_the_vector_environment_keeps_gymnasiums_contract() -> None:
 
 
 def test_a_reset_mask_resets_only_some() -> None:
-    vector = TIntersectionVectorEnv(2)
+    vector = SceneVectorEnv(2)
     vector.reset(seed=0)
     for _ in range(10):
         vector.step(np.array([GO, GO]))
@@ -253,8 +286,8 @@ def test_a_reset_mask_resets_only_some() -> None:
 
 
 def test_the_stable_baselines3_adapter() -> None:
-    venv = VecMonitor(TIntersectionVecEnv(4, seed=0, time_limit_s=1.0))
-    observation = venv.reset()
+    venv = VecMonitor(SceneVecEnv(4, seed=0, time_limit_s=1.0, tracks=True))
+    observation: Any = venv.reset()
     assert observation["vehicles"].shape == (4, 12, 2)
     assert len(venv.reset_infos) == 4
     kept = {key: value.copy() for key, value in observation.items()}
@@ -267,14 +300,16 @@ def test_the_stable_baselines3_adapter() -> None:
         assert info["TimeLimit.truncated"]
         assert info["outcome"] == "timeout"
         assert info["episode"]["l"] == 10
-        assert info["terminal_observation"]["mask"].sum() == np.abs(info["terminal_traits"]).sum()
-        assert info["traits"].shape == (12,)
+        assert_equal(info["terminal_observation"]["mask"], info["terminal_slots"]["traits"] >= 0)
+        assert info["terminal_slots"].keys() == venv.slots.keys() == {"traits", *TRACKS}
+    assert_equal(observation["mask"], venv.slots["traits"] >= 0)
+    assert_equal(venv.slots["traits"], [info["traits"] for info in infos])
     assert venv.get_attr("render_mode") == [None] * 4
     venv.close()
 
 
 def test_parked_environments_are_empty_until_the_next_reset() -> None:
-    venv, other = TIntersectionVecEnv(3, seed=5), TIntersectionVecEnv(3, seed=5)
+    venv, other = SceneVecEnv(3, seed=5), SceneVecEnv(3, seed=5)
     venv.reset(), other.reset()
     venv.env_method("park", indices=[1])
     for _ in range(20):
@@ -292,18 +327,18 @@ def test_parked_environments_are_empty_until_the_next_reset() -> None:
 
 
 def test_the_adapter_seeds_like_the_vector_environment() -> None:
-    venv, vector = TIntersectionVecEnv(3, seed=11), TIntersectionVectorEnv(3)
+    venv, vector = SceneVecEnv(3, seed=11), SceneVectorEnv(3)
     assert_equal(venv.reset(), vector.reset(seed=11)[0])
     venv.close()
     vector.close()
 
 
 def test_rendering_shows_every_vehicle() -> None:
-    env = TIntersectionEnv(render_mode="rgb_array")
+    env = SceneEnv(render_mode="rgb_array")
     _, info = env.reset(seed=0)
     image = env.render()
     assert image is not None and image.dtype == np.uint8 and image.shape == (320, 736, 3)
-    for value, colour in ((1, (40, 90, 200)), (-1, (200, 40, 40))):
+    for value, colour in enumerate(((40, 90, 200), (200, 40, 40))):
         pixels = np.isclose(image, colour, atol=3).all(axis=2).sum()
         vehicles = int((info["traits"] == value).sum())
         assert pixels == pytest.approx(vehicles * 5 * 2 * 16 * 16 * 0.85, rel=0.2)  # less the windscreens
@@ -313,6 +348,7 @@ def test_rendering_shows_every_vehicle() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ({"scene": "moon"}, "unknown scene 'moon'; choose one of: .*t_intersection"),
         ({"p_conservative": 1.5}, r"must be a probability in \[0, 1\], or two of them from low to high, not 1.5"),
         ({"p_conservative": (0.6, 0.2)}, r"from low to high, not \(0.6, 0.2\)"),
         ({"p_conservative": (0.1, 0.2, 0.3)}, "must be a probability"),
@@ -327,12 +363,12 @@ def test_rendering_shows_every_vehicle() -> None:
 )
 def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        TIntersectionEnv(**arguments)
+        SceneEnv(**arguments)
 
 
 @pytest.mark.parametrize("actions", [[-1, 0], [0, 3], [0]])
 def test_actions_out_of_range_are_refused(actions: list[int]) -> None:
-    vector = TIntersectionVectorEnv(2)
+    vector = SceneVectorEnv(2)
     vector.reset(seed=0)
     with pytest.raises(InputError, match="actions must be 2 of 0, 1, 2"):
         vector.step(np.array(actions))
@@ -340,9 +376,9 @@ def test_actions_out_of_range_are_refused(actions: list[int]) -> None:
 
 
 def test_seeds_must_fit_the_environments() -> None:
-    vector = TIntersectionVectorEnv(2)
+    vector = SceneVectorEnv(2)
     with pytest.raises(InputError, match="3 seeds do not fit 2 environments"):
         vector.reset(seed=[1, 2, 3])
     vector.close()
     with pytest.raises(InputError, match="num_envs must be at least 1"):
-        TIntersectionVectorEnv(0)
+        SceneVectorEnv(0)

@@ -14,18 +14,17 @@ import gymnasium
 import numpy as np
 import pytest
 
-from tests.envs.test_environments import assert_equal
-from tint_sumo import ENV_ID
-from tint_sumo.envs.sb3 import TIntersectionVecEnv
-from tint_sumo.envs.vector import TIntersectionVectorEnv
+from tests.envs.test_environments import ENV_ID, assert_equal
+from tint_sumo.envs.sb3 import SceneVecEnv
+from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.errors import InputError
 
 PATIENCE_S = 30.0
 
 
 @pytest.fixture
-def vector() -> Iterator[TIntersectionVectorEnv]:
-    vector = TIntersectionVectorEnv(3, workers=3)
+def vector() -> Iterator[SceneVectorEnv]:
+    vector = SceneVectorEnv(3, workers=3)
     yield vector
     vector.close()
 
@@ -49,9 +48,9 @@ def wait_until_ended(process_ids: list[int]) -> None:
 
 @pytest.mark.parametrize("workers", [2, 3])
 def test_results_do_not_depend_on_the_number_of_workers(workers: int) -> None:
-    settings: dict[str, Any] = {"time_limit_s": 6.0, "position_noise_m": 0.1, "p_conservative": 0.6}
-    one = TIntersectionVectorEnv(5, **settings)
-    many = TIntersectionVectorEnv(5, **settings, workers=workers)
+    settings: dict[str, Any] = {"time_limit_s": 6.0, "position_noise_m": 0.1, "p_conservative": 0.6, "tracks": True}
+    one = SceneVectorEnv(5, **settings)
+    many = SceneVectorEnv(5, **settings, workers=workers)
     try:
         assert_equal(one.reset(seed=7)[0], many.reset(seed=7)[0])
         rng = np.random.default_rng(0)
@@ -85,7 +84,7 @@ def assert_infos_equal(first: Any, second: Any) -> None:
 
 
 def test_the_stable_baselines3_adapter_takes_workers() -> None:
-    one, two = TIntersectionVecEnv(4, seed=3, time_limit_s=2.0), TIntersectionVecEnv(4, 3, time_limit_s=2.0, workers=2)
+    one, two = SceneVecEnv(4, seed=3, time_limit_s=2.0), SceneVecEnv(4, seed=3, time_limit_s=2.0, workers=2)
     try:
         assert_equal(one.reset(), two.reset())
         kept: Any = None
@@ -117,7 +116,7 @@ def test_gymnasium_makes_it_with_workers() -> None:
         vector.close()
 
 
-def test_closing_ends_the_workers(vector: TIntersectionVectorEnv) -> None:
+def test_closing_ends_the_workers(vector: SceneVectorEnv) -> None:
     ids = worker_ids()
     assert len(ids) == 2
     vector.reset(seed=0)
@@ -128,7 +127,7 @@ def test_closing_ends_the_workers(vector: TIntersectionVectorEnv) -> None:
         vector.step(np.zeros(3, np.int64))
 
 
-def test_a_killed_worker_is_reported_and_ends_the_others(vector: TIntersectionVectorEnv) -> None:
+def test_a_killed_worker_is_reported_and_ends_the_others(vector: SceneVectorEnv) -> None:
     vector.reset(seed=0)
     ids = worker_ids()
     os.kill(ids[0], signal.SIGKILL)
@@ -138,13 +137,13 @@ def test_a_killed_worker_is_reported_and_ends_the_others(vector: TIntersectionVe
     assert not any(map(is_alive, ids))
 
 
-def test_an_error_in_a_worker_reaches_the_caller(vector: TIntersectionVectorEnv) -> None:
+def test_an_error_in_a_worker_reaches_the_caller(vector: SceneVectorEnv) -> None:
     with pytest.raises(RuntimeError, match=r"worker 2 failed:\n(?s:.*)Seed must be"):
         vector.reset(seed=[1, 2, -3])
     assert not worker_ids()
 
 
-def test_an_error_in_this_process_ends_the_workers(vector: TIntersectionVectorEnv) -> None:
+def test_an_error_in_this_process_ends_the_workers(vector: SceneVectorEnv) -> None:
     with pytest.raises(gymnasium.error.Error, match="Seed must be"):
         vector.reset(seed=[-1, 2, 3])
     assert not worker_ids()
@@ -153,10 +152,10 @@ def test_an_error_in_this_process_ends_the_workers(vector: TIntersectionVectorEn
 
 
 def test_this_process_takes_part_unless_its_libsumo_is_taken() -> None:
-    first = TIntersectionVectorEnv(2, workers=2)
+    first = SceneVectorEnv(2, workers=2)
     try:
         assert len(worker_ids()) == 1
-        second = TIntersectionVectorEnv(2, workers=2)
+        second = SceneVectorEnv(2, workers=2)
         try:
             assert len(worker_ids()) == 3
             assert_equal(first.reset(seed=0)[0], second.reset(seed=0)[0])
@@ -169,7 +168,7 @@ def test_this_process_takes_part_unless_its_libsumo_is_taken() -> None:
         first.close()
 
 
-def test_bad_actions_are_refused_before_any_worker_steps(vector: TIntersectionVectorEnv) -> None:
+def test_bad_actions_are_refused_before_any_worker_steps(vector: SceneVectorEnv) -> None:
     vector.reset(seed=0)
     with pytest.raises(InputError, match="actions must be 3 of 0, 1, 2"):
         vector.step(np.array([0, 1, 3]))
@@ -180,7 +179,7 @@ def test_bad_actions_are_refused_before_any_worker_steps(vector: TIntersectionVe
 @pytest.mark.parametrize("workers", [0, 3])
 def test_the_number_of_workers_must_fit(workers: int) -> None:
     with pytest.raises(InputError, match=f"workers must be 1 to num_envs = 2, not {workers}"):
-        TIntersectionVectorEnv(2, workers=workers)
+        SceneVectorEnv(2, workers=workers)
 
 
 @pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGINT])
@@ -189,10 +188,10 @@ def test_workers_never_outlive_the_main_process(tmp_path: Path, ending: signal.S
     script.write_text("""
 import multiprocessing
 import numpy as np
-from tint_sumo.envs.vector import TIntersectionVectorEnv
+from tint_sumo.envs.vector import SceneVectorEnv
 
 if __name__ == "__main__":
-    vector = TIntersectionVectorEnv(4, workers=3)
+    vector = SceneVectorEnv(4, workers=3)
     vector.reset(seed=0)
     print(*(process.pid for process in multiprocessing.active_children()), flush=True)
     while True:

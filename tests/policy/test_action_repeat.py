@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.errors import InputError
 from tint_sumo.policy import ActionRepeat
 
@@ -9,7 +9,7 @@ GO, STOP = 2, 0
 
 
 def test_a_decision_is_so_many_steps_and_the_sum_of_their_rewards() -> None:
-    plain, repeated = TIntersectionVecEnv(3, seed=0), ActionRepeat(TIntersectionVecEnv(3, seed=0, backend="traci"), 4)
+    plain, repeated = SceneVecEnv(3, seed=0), ActionRepeat(SceneVecEnv(3, seed=0, backend="traci"), 4)
     plain.reset()
     repeated.reset()
     for action in (GO, STOP, GO):
@@ -26,7 +26,7 @@ def test_a_decision_is_so_many_steps_and_the_sum_of_their_rewards() -> None:
 
 
 def test_an_episode_ends_the_decision_and_the_next_one_waits() -> None:
-    venv = ActionRepeat(TIntersectionVecEnv(2, seed=0, time_limit_s=0.6), 4)
+    venv = ActionRepeat(SceneVecEnv(2, seed=0, time_limit_s=0.6), 4)
     venv.reset()
     assert not venv.step(np.full(2, GO))[2].any()
     observation, rewards, done, infos = venv.step(np.full(2, GO))
@@ -41,7 +41,7 @@ def test_an_episode_ends_the_decision_and_the_next_one_waits() -> None:
 
 
 def test_at_least_one_step() -> None:
-    venv = TIntersectionVecEnv(1)
+    venv = SceneVecEnv(1)
     with pytest.raises(InputError, match="at least 1 step, not 0"):
         ActionRepeat(venv, 0)
     venv.close()

@@ -11,6 +11,7 @@ import torch
 from gymnasium import spaces
 
 from tests.bombs import BOMBS, bomb
+from tests.simulation.scenes import T
 from tint_sumo.config import PolicySettings
 from tint_sumo.envs.episodes import action_space, observation_space
 from tint_sumo.errors import InputError
@@ -24,11 +25,11 @@ from .tasks import SMALL
 
 def make(trait_size: int = 2, *, informed_critic: bool = False, settings: PolicySettings = SMALL) -> GruPolicy:
     """A policy of a T-intersection that nobody trained."""
-    parts = {**observation_space().spaces, TRAITS: trait_space(trait_size)}
+    parts = {**observation_space(12).spaces, TRAITS: trait_space(12, trait_size)}
     if informed_critic:
-        parts[TRUE_TRAITS] = trait_space(2)
+        parts[TRUE_TRAITS] = trait_space(12, 2)
     torch.manual_seed(0)
-    return GruPolicy(spaces.Dict(parts), action_space(), lambda _: 1e-3, settings=settings)
+    return GruPolicy(spaces.Dict(parts), action_space(T), lambda _: 1e-3, settings=settings)
 
 
 @pytest.fixture
@@ -103,6 +104,7 @@ def test_the_card_tells_what_it_was_given_and_what_the_network_is(saved: Path) -
     assert card["method"] == "oracle"
     assert card["network"]["trait_size"] == 2
     assert card["network"]["critic_sees_true_traits"] is False
+    assert (card["network"]["max_vehicles"], card["network"]["actions"]) == (12, 3)
     assert card["network"]["settings"]["hidden_size"] == SMALL.hidden_size
 
 
@@ -178,6 +180,10 @@ def test_an_unreadable_card_is_reported(saved: Path, text: str) -> None:
         {"trait_size": -2},
         {"trait_size": 10**13},
         {"trait_size": None},
+        {"max_vehicles": "many"},
+        {"max_vehicles": -1},
+        {"actions": 0},
+        {"actions": None},
     ],
 )
 def test_networks_nobody_can_build_are_reported(saved: Path, network: Mapping[str, Any]) -> None:
@@ -186,7 +192,7 @@ def test_networks_nobody_can_build_are_reported(saved: Path, network: Mapping[st
     assert "policy.json: unusable network" in refused(saved)
 
 
-@pytest.mark.parametrize("entry", ["settings", "trait_size", "critic_sees_true_traits"])
+@pytest.mark.parametrize("entry", ["settings", "trait_size", "critic_sees_true_traits", "max_vehicles", "actions"])
 def test_networks_with_a_part_missing_are_reported(saved: Path, entry: str) -> None:
     card = read_policy_card(saved)
     del card["network"][entry]

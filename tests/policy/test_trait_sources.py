@@ -1,12 +1,12 @@
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
 
-from tint_sumo.config import POSITION_SCALE_M
-from tint_sumo.dataset.schema import NO_LEADER_GAP_M
+from tint_sumo.config import NO_LEADER_GAP_M
 from tint_sumo.errors import InputError
 from tint_sumo.policy.trait_observation import TRUE_TRAITS, TraitObservation
 from tint_sumo.policy.trait_sources import (
@@ -21,39 +21,50 @@ from tint_sumo.traits import load
 
 from .tasks import STREET, FakeVecEnv, Memory
 
-LOWER_Y, UPPER_Y = 2.0, 6.0
-Scene = dict[int, tuple[float, float]]  # slot: centre (x, y) in m
+
+class Seen(NamedTuple):
+    """A vehicle on its route."""
+
+    position_m: float
+    gap_m: float = math.inf
+    passed: bool = False
+
+
+Scene = dict[int, Seen]  # by slot
 
 
 class Script(FakeVecEnv):
     """Environments that play scenes written by hand: ``episodes[env]`` is a list of episodes, an episode a list of
-    (scene, ego's y), one each step. Traits are conservative in even slots, aggressive in odd ones."""
+    scenes, one each step. Traits are conservative in even slots, aggressive in odd ones."""
 
-    def __init__(self, episodes: list[list[list[tuple[Scene, float]]]]) -> None:
+    slots: dict[str, np.ndarray]
+
+    def __init__(self, episodes: list[list[list[Scene]]]) -> None:
         super().__init__(len(episodes), STREET, spaces.Discrete(3))
         self.episodes = episodes
 
-    def frame(self, env: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        scene, ego_y = self.episodes[env][self.episode[env]][self.time[env]]
-        ego = np.array([0.0, ego_y])
-        observation = {key: np.zeros(space.shape, np.float32) for key, space in STREET.items()}
-        observation["ego"][:2] = ego / POSITION_SCALE_M
-        labels = np.zeros(12, np.int8)
-        for slot, centre in scene.items():
-            observation["vehicles"][slot] = (np.array(centre) - ego) / POSITION_SCALE_M
+    def frame(self, env: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        observation: dict[str, np.ndarray] = {key: np.zeros(box.shape, np.float32) for key, box in STREET.items()}
+        slots: dict[str, np.ndarray] = {
+            "traits": np.full(12, -1),
+            "position_m": np.zeros(12),
+            "gap_m": np.full(12, math.inf),
+            "passed": np.zeros(12, np.int8),
+        }
+        for slot, seen in self.episodes[env][self.episode[env]][self.time[env]].items():
             observation["mask"][slot] = 1.0
-            labels[slot] = 1 if slot % 2 == 0 else -1
-        return observation, labels
+            slots["traits"][slot] = slot % 2
+            slots["position_m"][slot], slots["gap_m"][slot], slots["passed"][slot] = seen
+        return observation, slots
 
-    def frames(self) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
-        observations, labels = zip(*map(self.frame, range(self.num_envs)), strict=True)
-        return {key: np.stack([o[key] for o in observations]) for key in STREET}, list(labels)
+    def frames(self) -> dict[str, np.ndarray]:
+        observations, slots = zip(*map(self.frame, range(self.num_envs)), strict=True)
+        self.slots = {key: np.stack([one[key] for one in slots]) for key in slots[0]}
+        return {key: np.stack([one[key] for one in observations]) for key in STREET}
 
     def reset(self) -> dict[str, np.ndarray]:
         self.episode, self.time = [0] * self.num_envs, [0] * self.num_envs
-        observations, labels = self.frames()
-        self.reset_infos = [{"traits": label} for label in labels]
-        return observations
+        return self.frames()
 
     def step_async(self, actions: np.ndarray) -> None: ...
 
@@ -64,12 +75,9 @@ class Script(FakeVecEnv):
             self.time[env] += 1
             done[env] = self.time[env] == len(self.episodes[env][self.episode[env]]) - 1
             if done[env]:
-                info["terminal_observation"], info["terminal_traits"] = self.frame(env)
+                info["terminal_observation"], info["terminal_slots"] = self.frame(env)
                 self.episode[env], self.time[env] = self.episode[env] + 1, 0
-        observations, labels = self.frames()
-        for info, label in zip(infos, labels, strict=True):
-            info["traits"] = label
-        return observations, np.zeros(self.num_envs, np.float32), done, infos
+        return self.frames(), np.zeros(self.num_envs, np.float32), done, infos
 
 
 class Spy:
@@ -86,7 +94,7 @@ class Spy:
         return last, torch.zeros_like(last)
 
 
-def play(episodes: list[list[list[tuple[Scene, float]]]], source: TraitSource, steps: int) -> tuple[np.ndarray, Any]:
+def play(episodes: list[list[list[Scene]]], source: TraitSource, steps: int) -> tuple[np.ndarray, Any]:
     """Traits (steps + 1, N, 12, 2) and all infos of a run."""
     env = TraitObservation(Script(episodes), source)
     traits, infos = [env.reset()["traits"]], []
@@ -98,11 +106,9 @@ def play(episodes: list[list[list[tuple[Scene, float]]]], source: TraitSource, s
     return np.stack(traits), infos
 
 
-def drive(steps: int, ego_y: float = -5.0, scene: Scene | None = None) -> list[tuple[Scene, float]]:
-    """Slot 3 drives east in the upper lane at 2 m/s from x = -10, slot 5 west in the lower lane at 3 m/s from 10."""
-    return [
-        ({3: (-10.0 + 0.2 * k, UPPER_Y), 5: (10.0 - 0.3 * k, LOWER_Y), **(scene or {})}, ego_y) for k in range(steps)
-    ]
+def drive(steps: int) -> list[Scene]:
+    """Slot 3 drives at 2 m/s, slot 5 at 3 m/s; nobody is ahead of them."""
+    return [{3: Seen(15.0 + 0.2 * k), 5: Seen(10.0 + 0.3 * k)} for k in range(steps)]
 
 
 def test_windows_of_the_last_twenty_steps() -> None:
@@ -114,7 +120,7 @@ def test_windows_of_the_last_twenty_steps() -> None:
         assert states.dtype == torch.float32 and states.shape == (2, 20, 2)
         assert length.dtype == torch.int64 and length.tolist() == [20, 20]
         steps = torch.arange(20)
-        torch.testing.assert_close(states[0, :, 0], 0.2 * steps, atol=1e-4, rtol=0)  # grows, whatever the direction
+        torch.testing.assert_close(states[0, :, 0], 0.2 * steps, atol=1e-4, rtol=0)
         torch.testing.assert_close(states[1, :, 0], 0.3 * steps, atol=1e-4, rtol=0)
         assert (states[..., 1] == 20.0).all()  # nobody ahead
     np.testing.assert_allclose(traits[20:, 0, 3], [[3.8, 20.0]] * 26, atol=1e-4)
@@ -122,42 +128,26 @@ def test_windows_of_the_last_twenty_steps() -> None:
     assert (traits[:, 0, [0, 1, 2, 4, 6, 7, 8, 9, 10, 11]] == 0.0).all()
 
 
-def test_gap_is_to_the_nearest_vehicle_ahead_in_the_lane() -> None:
-    scene = {
-        0: (-15.0, UPPER_Y),  # 7 m to slot 1
-        1: (-3.0, UPPER_Y),  # 5.5 m to slot 2
-        2: (7.5, UPPER_Y),  # leads the upper lane
-        6: (-17.0, LOWER_Y),  # leads the lower lane, which runs west
-        7: (-10.0, LOWER_Y),  # 2 m to slot 6
-        8: (16.0, LOWER_Y),  # 21 m to slot 7: farther than a gap can be
-    }
+def test_gaps_are_those_seen_up_to_the_largest_that_counts() -> None:
+    scene = {0: Seen(10.0, 7.0), 1: Seen(22.0, 5.5), 2: Seen(33.0), 8: Seen(9.0, 21.0)}
     spy = Spy()
-    play([[[(scene, -5.0)] * 30]], EncoderTraits(spy), 20)
+    play([[[scene] * 30]], EncoderTraits(spy), 20)
     ((states, _),) = spy.calls
-    expected = torch.tensor([7.0, 5.5, 20.0, 20.0, 2.0, 20.0])
-    torch.testing.assert_close(states[..., 1], expected[:, None].expand(6, 20), atol=1e-4, rtol=0)
+    expected = torch.tensor([7.0, 5.5, 20.0, 20.0])
+    torch.testing.assert_close(states[..., 1], expected[:, None].expand(4, 20), atol=1e-4, rtol=0)
     assert (states[..., 0].abs() < 1e-4).all()
-
-
-def test_ego_motion_cancels_out() -> None:
-    moving = [(scene, -5.0 + 0.1 * k) for k, (scene, _) in enumerate(drive(30))]
-    traits, _ = play([[moving], [drive(30)]], EncoderTraits(Spy()), 20)
-    np.testing.assert_allclose(traits[20, 0], traits[20, 1], atol=1e-4)
 
 
 def test_short_windows_of_vehicles_seen_for_a_shorter_time() -> None:
     """Slot 0 appears at step 13, slot 1 at step 19, slot 2 at step 20."""
     episode = [
-        (
-            {
-                **scene,
-                **({0: (-20.0 + 0.1 * k, UPPER_Y)} if k >= 13 else {}),
-                **({1: (20.0 - 0.1 * k, LOWER_Y)} if k >= 19 else {}),
-                **({2: (5.0, UPPER_Y)} if k >= 20 else {}),
-            },
-            ego_y,
-        )
-        for k, (scene, ego_y) in enumerate(drive(30))
+        {
+            **scene,
+            **({0: Seen(5.0 + 0.1 * k)} if k >= 13 else {}),
+            **({1: Seen(5.0 + 0.1 * k)} if k >= 19 else {}),
+            **({2: Seen(30.0)} if k >= 20 else {}),
+        }
+        for k, scene in enumerate(drive(30))
     ]
     spy = Spy()
     traits, _ = play([[episode]], EncoderTraits(spy), 20)
@@ -172,8 +162,8 @@ def test_short_windows_of_vehicles_seen_for_a_shorter_time() -> None:
 def test_a_slot_is_zeroed_when_its_vehicle_leaves() -> None:
     """Slot 3's vehicle leaves at step 25; another one takes the slot at step 27."""
     episode = [
-        ({slot: at for slot, at in scene.items() if slot != 3 or not 25 <= k < 27}, ego_y)
-        for k, (scene, ego_y) in enumerate(drive(50))
+        {slot: seen for slot, seen in scene.items() if slot != 3 or not 25 <= k < 27}
+        for k, scene in enumerate(drive(50))
     ]
     spy = Spy()
     traits, _ = play([[episode]], EncoderTraits(spy), 42)
@@ -185,10 +175,10 @@ def test_a_slot_is_zeroed_when_its_vehicle_leaves() -> None:
 
 
 def test_drivers_in_a_passed_lane_keep_their_trait() -> None:
-    """From step 30 on the ego is past the lower lane, where vehicles stop; the upper lane is never passed."""
-    episode = drive(31) + [({3: (-4.0, UPPER_Y), 5: (1.0, LOWER_Y)}, 4.1)] * 40
+    """From step 30 on the vehicles stand; the first ego has passed the lane of slot 5 then, the second one has not."""
+    first, second = (drive(31) + [{3: Seen(21.0), 5: Seen(19.0, passed=passed)}] * 40 for passed in (True, False))
     spy = Spy()
-    traits, _ = play([[episode], [[(scene, min(ego_y, 3.9)) for scene, ego_y in episode]]], EncoderTraits(spy), 62)
+    traits, _ = play([[first], [second]], EncoderTraits(spy), 62)
     assert [len(length) for _, length in spy.calls] == [4, 3, 3]
     np.testing.assert_array_equal(traits[62, 0, 5], traits[20, 0, 5])
     np.testing.assert_allclose(traits[62, 1, 5, 0], 0.0, atol=1e-4)
@@ -223,7 +213,7 @@ def test_reset_in_the_middle_of_an_episode_starts_over() -> None:
 
 def test_no_vehicles_no_call() -> None:
     spy = Spy()
-    traits, _ = play([[[({}, -5.0)] * 30]], EncoderTraits(spy), 25)
+    traits, _ = play([[[{}] * 30]], EncoderTraits(spy), 25)
     assert not spy.calls and (traits == 0.0).all()
 
 
@@ -236,7 +226,7 @@ def test_scale_divides_traits() -> None:
 def test_oracle_knows_at_once() -> None:
     """Slot 5 is aggressive; slot 4, conservative, is on the street at the terminal observation only."""
     first = drive(3)
-    first[2] = ({4: (0.0, LOWER_Y)}, -5.0)
+    first[2] = {4: Seen(20.0)}
     traits, infos = play([[first, drive(9)], [drive(9)]], OracleTraits(), 3)
     expected = np.zeros((12, 2))
     expected[[3, 5]] = (0.0, 1.0)
@@ -274,11 +264,11 @@ def test_other_environments_are_refused() -> None:
 
 
 def test_streaming_is_the_posterior_of_the_track_so_far() -> None:
-    """Slot 0 appears at step 13; slot 3's vehicle is followed over more than two windows."""
+    """Slot 0 appears at step 13, behind slot 3, whose vehicle is followed over more than two windows."""
     model = load("cross_window")
+    gap_m = 5.0 - 0.04 * np.arange(60)
     episode = [
-        ({**scene, **({0: (-20.0 + 0.24 * k, UPPER_Y)} if k >= 13 else {})}, ego_y)
-        for k, (scene, ego_y) in enumerate(drive(60, ego_y=1.0))
+        {**scene, **({0: Seen(5.0 + 0.24 * k, gap_m[k])} if k >= 13 else {})} for k, scene in enumerate(drive(60))
     ]
     traits, _ = play([[episode]], StreamingTraits(model), 55)
     for slot, start, speed_m in ((3, 0, 0.2), (0, 13, 0.24)):
@@ -286,11 +276,7 @@ def test_streaming_is_the_posterior_of_the_track_so_far() -> None:
             count = step - start + 1
             states = torch.zeros(1, count, 2)
             states[0, :, 0] = speed_m * (torch.arange(count) % 20)  # from each window's first position
-            gap_m = np.full(count, NO_LEADER_GAP_M)
-            if slot == 0:  # follows slot 3
-                scenes = [frame[0] for frame in episode[start : step + 1]]
-                gap_m = np.array([one[3][0] - one[0][0] - 5.0 for one in scenes]).clip(max=NO_LEADER_GAP_M)
-            states[0, :, 1] = torch.from_numpy(gap_m)
+            states[0, :, 1] = NO_LEADER_GAP_M if slot == 3 else torch.from_numpy(gap_m[start : step + 1])
             mean, log_var = model.encode(states, torch.tensor([count]))
             np.testing.assert_allclose(traits[step, 0, slot, :2], mean[0], atol=2e-3)
             np.testing.assert_allclose(traits[step, 0, slot, 2:4], torch.exp(0.5 * log_var[0]), atol=2e-3)
@@ -308,8 +294,8 @@ def test_streaming_begins_with_the_prior_and_leaves_empty_slots_zero() -> None:
 
 def test_streaming_forgets_a_vehicle_that_has_left() -> None:
     episode = [
-        ({slot: at for slot, at in scene.items() if slot != 3 or not 25 <= k < 27}, ego_y)
-        for k, (scene, ego_y) in enumerate(drive(50))
+        {slot: seen for slot, seen in scene.items() if slot != 3 or not 25 <= k < 27}
+        for k, scene in enumerate(drive(50))
     ]
     traits, _ = play([[episode]], StreamingTraits(load("cross_window")), 30)
     assert (traits[25:27, 0, 3] == 0.0).all()

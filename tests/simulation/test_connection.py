@@ -5,54 +5,56 @@ import sys
 
 import pytest
 
+from tests.simulation.scenes import T
 from tint_sumo.errors import InputError
-from tint_sumo.simulation.intersections import Intersections
+from tint_sumo.simulation.simulation import Simulation
 
 
 def test_a_second_simulation_in_the_process_takes_traci_and_libsumo_comes_back() -> None:
-    first, second = Intersections(1), Intersections(1)
+    first, second = Simulation(1, T), Simulation(1, T)
     assert (first.backend, second.backend) == ("libsumo", "traci")
     with pytest.raises(InputError, match="libsumo already runs"):
-        Intersections(1, backend="libsumo")
+        Simulation(1, T, backend="libsumo")
     first.close()
     first.close()
-    third = Intersections(1, backend="libsumo")
+    third = Simulation(1, T, backend="libsumo")
     assert third.backend == "libsumo"
     second.close()
     third.close()
 
 
 def test_traci_when_asked_for() -> None:
-    simulation = Intersections(1, backend="traci")
+    simulation = Simulation(1, T, backend="traci")
     assert simulation.backend == "traci"
     simulation.close()
 
 
 def test_a_forgotten_simulation_gives_libsumo_free() -> None:
-    simulation = Intersections(1, backend="libsumo")
+    simulation = Simulation(1, T, backend="libsumo")
     del simulation
     gc.collect()
-    again = Intersections(1, backend="libsumo")
+    again = Simulation(1, T, backend="libsumo")
     again.close()
 
 
 def test_unknown_backend() -> None:
     with pytest.raises(InputError, match="unknown backend 'gui'; choose auto, libsumo or traci"):
-        Intersections(1, backend="gui")  # type: ignore[arg-type]
+        Simulation(1, T, backend="gui")  # type: ignore[arg-type]
 
 
 def test_traci_says_nothing_on_stdout(capfd: pytest.CaptureFixture[str]) -> None:
-    Intersections(1, backend="traci").close()
+    Simulation(1, T, backend="traci").close()
     assert capfd.readouterr().out == ""
 
 
 def test_a_second_simulation_where_libsumo_stands_in_for_traci() -> None:
     """Users of other SUMO learning environments have this variable set; ``import traci`` then gives libsumo."""
     code = (
-        "from tint_sumo.simulation.intersections import Intersections\n"
-        "first, second = Intersections(1), Intersections(1)\n"
+        "from tint_sumo.simulation.simulation import Simulation\n"
+        "from tint_sumo.scenes import find_scene\n"
+        "first, second = (Simulation(1, find_scene('t_intersection')) for _ in range(2))\n"
         "first.reset(0, 0), second.reset(0, 0), first.step(), second.step()\n"
-        "assert (first.front_m == second.front_m).all() and first.present.any()\n"
+        "assert (first.slots.front_m == second.slots.front_m).all() and first.slots.present.any()\n"
         "print(first.backend, second.backend)\n"
     )
     environment = os.environ | {"LIBSUMO_AS_TRACI": "1"}

@@ -2,10 +2,12 @@ import math
 
 import pytest
 
-from tint_sumo.config import Scenario
-from tint_sumo.simulation.ego import EgoRules, acceleration_mps2, claims, is_unsafe
+from tint_sumo.scenes import T_INTERSECTION, find_scene
+from tint_sumo.scenes.layout import layout
+from tint_sumo.simulation.ego import EgoRules, Egos, acceleration_mps2, is_unsafe
 
-RULES = EgoRules.of(Scenario())
+T = find_scene(T_INTERSECTION)
+RULES = EgoRules.of(T)
 
 
 @pytest.mark.parametrize(
@@ -39,19 +41,29 @@ def test_safety_check(distance_m: float, closing_mps: float, unsafe: bool) -> No
 
 
 @pytest.mark.parametrize(
-    ("front_y_m", "towards_mps", "lower", "upper"),
+    ("past_m", "speed_mps", "claimed"),
     [
-        (-0.1, 3.0, False, False),
-        (0.1, 0.6, True, False),
-        (0.1, 0.5, False, False),  # creeping is no claim
-        (0.9, 0.0, False, False),  # nor is standing short of the path
-        (1.1, 0.0, True, False),
-        (3.9, 3.0, True, False),
-        (4.1, 0.6, True, True),
-        (4.1, 0.0, True, False),
-        (5.1, 0.0, True, True),
+        (-0.1, 3.0, False),
+        (0.1, 0.6, True),
+        (0.1, 0.5, False),  # creeping is no claim
+        (0.9, 0.0, False),  # nor is standing short of the vehicles' path
+        (1.1, 0.0, True),
     ],
 )
-def test_claims(front_y_m: float, towards_mps: float, lower: bool, upper: bool) -> None:
-    assert claims(front_y_m, towards_mps, RULES.lower_border_y_m, RULES) == lower
-    assert claims(front_y_m, towards_mps, RULES.upper_border_y_m, RULES) == upper
+def test_claims_on_the_first_lane(past_m: float, speed_mps: float, claimed: bool) -> None:
+    egos = Egos(1, layout(T))
+    egos.front_m[0], egos.speed_mps[0] = layout(T).zones.enter_m[0] + past_m, speed_mps
+    assert egos.update_claims() is claimed
+    assert egos.has_claimed.tolist() == [[claimed, False]]
+    assert not egos.update_claims()
+
+
+def test_speed_along_a_lane_is_no_claim_on_it() -> None:
+    """In its turn the ego comes closer to the second lane by only a part of its speed."""
+    zones = layout(T).zones
+    egos = Egos(1, layout(T))
+    egos.front_m[0] = zones.enter_m[1] + 0.1
+    for speed_mps, claimed in ((0.6, False), (0.7, True)):
+        egos.speed_mps[0] = speed_mps
+        egos.update_claims()
+        assert egos.has_claimed.tolist() == [[True, claimed]]

@@ -30,6 +30,6 @@ def encoders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("encoders")
     small = TraitSettings(embedding_sizes=(), hidden_size=4, encoder_output_size=4, decoder_output_size=4)
     torch.manual_seed(0)
-    for name, method in traits.METHODS.items():
+    for name, method in traits.TRAIT_METHODS.items():
         save(method(small), folder / name, {"seed": 0})
     return folder

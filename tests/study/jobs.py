@@ -8,8 +8,8 @@ from pathlib import Path
 
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_text
+from tint_sumo.progress import Report
 from tint_sumo.study.pool import run_jobs
-from tint_sumo.study.progress import Report
 
 
 @dataclass(frozen=True)

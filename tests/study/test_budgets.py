@@ -54,7 +54,7 @@ def test_the_full_budget_compares_all_methods_with_three_seeds_in_other_worlds_t
     full = BUDGETS["full"]
     assert len(full.seeds) == 3 and full.mixes == (ALL_MIXES,)
     trained = [method for method in map(find_method, full.methods) if isinstance(method, Learned)]
-    assert {method.encoder for method in trained} - {None} == set(traits.METHODS)
+    assert {method.encoder for method in trained} - {None} == set(traits.TRAIT_METHODS)
     conditions = {one for trials in full.trials for one in trials.conditions}
     assert {one.position_noise_m for one in conditions} > {0.0, 0.1}
     assert min(one.tau_s for one in conditions) < Idm.tau_s < max(one.tau_s for one in conditions)

@@ -4,27 +4,29 @@ from dataclasses import replace
 
 import pytest
 
-from tests.simulation.scenes import GO, scene, until
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DriverProfile, Scenario
-from tint_sumo.scenario.geometry import LOWER, UPPER, swept_area_start_m
-from tint_sumo.simulation.intersections import Intersections, PlacedVehicle
+from tests.simulation.scenes import GO, LOWER, UPPER, T, scene, until
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DriverProfile
+from tint_sumo.scenes import Scene
+from tint_sumo.scenes.layout import layout
+from tint_sumo.simulation.demand import PlacedVehicle
+from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.study import ceiling as module
-from tint_sumo.study.ceiling import _finishes, _openings, _way_m, ceiling
+from tint_sumo.study.ceiling import _finishes, _openings, ceiling, way_m
 
-SCENARIO = Scenario()
-STOP_LINE_M = swept_area_start_m(SCENARIO.street, SCENARIO.vehicle, SCENARIO.ego.unsafe_distance_m).tolist()
-LENGTH_M = SCENARIO.vehicle.length_m
-Vehicle = tuple[int, DriverProfile, float]  # lane, driver, and how far its front is before the ego's way
+WAY_S = way_m(layout(T)) / GO
+STOP_LINE_M = layout(T).zones.stop_line_m.tolist()
+LENGTH_M = T.vehicle.length_m
+Vehicle = tuple[int, DriverProfile, float]  # route, driver, and how far its front is before the ego's way
 
 YIELDS_BELOW, YIELDS_ABOVE = (LOWER, CONSERVATIVE, 12.0), (UPPER, CONSERVATIVE, 12.0)
 
 
 @contextmanager
-def street(*vehicles: Vehicle, scenario: Scenario = SCENARIO) -> Iterator[Intersections]:
+def street(*vehicles: Vehicle, played: Scene = T) -> Iterator[Simulation]:
     """Traffic without an ego; nobody else comes."""
-    simulation = Intersections(1, scenario, with_ego=False)
+    simulation = Simulation(1, played, with_ego=False)
     members = {profile: index for index, profile in enumerate(one.profile for one in simulation.population)}
-    placed = [PlacedVehicle(lane, STOP_LINE_M[lane] - far_m, members[who]) for lane, who, far_m in vehicles]
+    placed = [PlacedVehicle(route, STOP_LINE_M[route] - far_m, members[who]) for route, who, far_m in vehicles]
     try:
         simulation.reset_to(0, placed)
         yield simulation
@@ -33,14 +35,14 @@ def street(*vehicles: Vehicle, scenario: Scenario = SCENARIO) -> Iterator[Inters
 
 
 def openings(*vehicles: Vehicle) -> list[list[tuple[float, float]]]:
-    """Of each lane."""
+    """Of each route."""
     with street(*vehicles) as simulation:
-        return _openings(simulation, SCENARIO)[0]
+        return _openings(simulation)[0]
 
 
-def finishes(*vehicles: Vehicle, scenario: Scenario = SCENARIO) -> bool:
-    with street(*vehicles, scenario=scenario) as simulation:
-        return bool(_finishes(simulation, scenario)[0])
+def finishes(*vehicles: Vehicle, played: Scene = T) -> bool:
+    with street(*vehicles, played=played) as simulation:
+        return bool(_finishes(simulation)[0])
 
 
 def drive_s(metres: float, driver: DriverProfile) -> float:
@@ -81,25 +83,23 @@ def test_an_ego_needs_a_yielding_driver_in_either_lane() -> None:
 
 
 def test_a_yielding_driver_that_comes_before_the_ego_does_not_help() -> None:
-    to_lower_s, to_upper_s, _ = _way_m(SCENARIO) / GO
+    to_lower_s, to_upper_s, _ = WAY_S
     assert drive_s(4.0, CONSERVATIVE) < to_lower_s + to_upper_s < drive_s(8.0, CONSERVATIVE)
     assert not finishes(YIELDS_BELOW, (UPPER, CONSERVATIVE, 4.0))
     assert finishes(YIELDS_BELOW, (UPPER, CONSERVATIVE, 8.0))
 
 
 def test_the_ego_must_be_through_before_the_time_limit() -> None:
-    way_s = _way_m(SCENARIO).sum() / GO
-    for time_limit_s, is_enough in ((way_s - 0.2, False), (way_s + 0.2, True)):
-        rules = replace(SCENARIO.episode, time_limit_s=round(time_limit_s, 1))
-        assert finishes(YIELDS_BELOW, YIELDS_ABOVE, scenario=replace(SCENARIO, episode=rules)) is is_enough
+    for margin_s, is_enough in ((-0.2, False), (0.2, True)):
+        played = replace(T, time_limit_s=round(WAY_S.sum() + margin_s, 1))
+        assert finishes(YIELDS_BELOW, YIELDS_ABOVE, played=played) is is_enough
 
 
 def test_no_ego_is_faster_through_than_the_ceiling_takes_it_to_be() -> None:
     with scene() as simulation:
-        until(simulation, GO, lambda: bool(simulation.ego_pose["x_m"][0] > SCENARIO.episode.goal_x_m))
+        until(simulation, GO, lambda: bool(simulation.egos.front_m[0] > T.ego.goal_m))
         taken_s = simulation.time_s[0]
-    way_s = _way_m(SCENARIO).sum() / GO
-    assert way_s <= taken_s <= way_s + 1.0  # it starts from standing
+    assert WAY_S.sum() <= taken_s <= WAY_S.sum() + 1.0  # it starts from standing
 
 
 def test_nobody_gets_through_where_nobody_yields_and_everybody_where_all_do() -> None:

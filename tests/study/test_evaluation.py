@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import VecEnv
 
-from tint_sumo.config import EpisodeRules
-from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.config import STEP_S
+from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.errors import InputError
 from tint_sumo.study.evaluation import CASE_SEED, Case, Evaluation, case_seed, evaluate
 from tint_sumo.study.rules import AlwaysGo, TimeToCollision
 
-make_venv = partial(TIntersectionVecEnv, p_conservative=0.6, time_limit_s=12.0)
+make_venv = partial(SceneVecEnv, p_conservative=0.6, time_limit_s=12.0)
 
 
 @pytest.mark.parametrize("policy", [AlwaysGo(), TimeToCollision(0.5)])
@@ -33,7 +33,7 @@ def test_a_case_is_the_first_episode_of_its_seed() -> None:
         steps += 1
     venv.close()
     assert infos[0]["outcome"] == case.outcome
-    assert case.time_s == pytest.approx(steps * EpisodeRules.step_s)
+    assert case.time_s == pytest.approx(steps * STEP_S)
 
 
 def test_seeds_are_different_cases() -> None:
@@ -43,14 +43,14 @@ def test_seeds_are_different_cases() -> None:
     assert case_seed(0) == CASE_SEED
 
 
-def test_collisions_are_told_by_trait_and_lane() -> None:
+def test_collisions_are_told_by_trait_and_route() -> None:
     found = evaluate(AlwaysGo(), make_venv, 16, 0)
     collisions = [case for case in found.cases if case.outcome == "collision"]
     assert sum(found.collisions.values()) == len(collisions) > 0
     for case in collisions:
-        assert f"{case.trait}, {case.lane} lane" in found.collisions
+        assert f"{case.trait}, {case.route}" in found.collisions
         assert case.trait in ("conservative", "aggressive")
-        assert case.lane in ("lower", "upper")
+        assert case.route in ("lower", "upper")
 
 
 class Recorder:
@@ -98,7 +98,7 @@ def test_summary() -> None:
     assert (found["success"], found["timeout"], found["collision"]) == (0.5, 0.25, 0.25)
     assert found["episodes"] == 4
     assert found["navigation_time_s"] == 15.0
-    assert found["collisions"] == {"a, upper lane": 1}
+    assert found["collisions"] == {"a, upper": 1}
     assert Evaluation(cases[2:]).summary()["navigation_time_s"] is None
 
 

@@ -12,6 +12,7 @@ from tint_sumo import traits
 from tint_sumo.config import PpoSettings, ends
 from tint_sumo.errors import InputError
 from tint_sumo.policy import EncoderTraits, NoTraits
+from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.study import loading
 from tint_sumo.study.budgets import ALL_MIXES
 from tint_sumo.study.evaluation import evaluate
@@ -90,6 +91,17 @@ def test_a_policy_drives_in_the_world_it_is_asked_to(run_with_traits: Path) -> N
     assert len(found.cases) == 3
 
 
+def test_a_policy_drives_in_the_scene_of_its_training_unless_another_one_is_asked_for(run: Path) -> None:
+    for name in (run, "ttc"):
+        assert load_policy(name).scene == T_INTERSECTION
+        contender = load_policy(name, scene="roundabout")
+        venv: Any = contender.make_venv(2)
+        assert venv.unwrapped.env.batch.episodes.simulation.scene.name == contender.scene == "roundabout"
+        contender.policy.predict(venv.reset(), deterministic=True)
+        venv.close()
+        assert "unknown scene 'moon'" in refused(name, scene="moon")
+
+
 def test_a_folder_that_is_called_like_a_rule_is_still_reached_by_path(run: Path) -> None:
     assert load_policy(run.rename(run.with_name("ttc"))).p_conservative == (0.1, 0.9)
 
@@ -154,6 +166,9 @@ def change_card(run: Path, **changes: Any) -> None:
         {"settings": {}},
         {"settings": None},
         {"settings": {"action_repeat": "1"}},
+        {"scene": None},
+        {"scene": "moon"},
+        {"scene": ["t_intersection"]},
         {"network": None},
     ],
 )

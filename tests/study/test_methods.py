@@ -7,6 +7,7 @@ from tint_sumo import traits
 from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.errors import RENAMED_METHODS, InputError
 from tint_sumo.policy import ClassifierTraits, EncoderTraits, NoTraits, OracleTraits, StreamingTraits
+from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import METHODS, Learned, Rule, find_learned, find_method, register
 from tint_sumo.study.rules import AlwaysGo
@@ -18,7 +19,7 @@ SMALL = TraitSettings(embedding_sizes=(), hidden_size=4, encoder_output_size=4, 
 
 def some_encoder(method: Learned) -> TraitModel | None:
     """A trait model as the method needs it, which nobody trained."""
-    return None if method.encoder is None else traits.METHODS[method.encoder](SMALL)
+    return None if method.encoder is None else traits.TRAIT_METHODS[method.encoder](SMALL)
 
 
 def test_rules_come_first_and_the_oracle_last() -> None:
@@ -35,7 +36,7 @@ def test_names_and_titles_belong_to_one_method_each() -> None:
 @pytest.mark.parametrize("name", LEARNED)
 def test_encoders_are_trait_methods_and_shared_trainings_are_methods_that_are_trained(name: str) -> None:
     method = find_learned(name)
-    assert method.encoder in (None, *traits.METHODS)
+    assert method.encoder in (None, *traits.TRAIT_METHODS)
     if method.trained_as is not None:
         other = find_learned(method.trained_as)
         assert other.trained_as is None
@@ -76,11 +77,11 @@ def test_rules_act() -> None:
     observation = {"ego": np.zeros((3, 4)), "vehicles": np.zeros((3, 12, 2)), "mask": np.zeros((3, 12))}
     for method in METHODS.values():
         if isinstance(method, Rule):
-            actions, _ = method.make().predict(observation)
+            actions, _ = method.make(T_INTERSECTION).predict(observation)
             assert actions.shape == (3,)
 
 
-@pytest.mark.parametrize("twin", [Rule("ttc", "another", AlwaysGo), Learned("ttc", "another", NoTraits)])
+@pytest.mark.parametrize("twin", [Rule("ttc", "another", lambda _: AlwaysGo()), Learned("ttc", "another", NoTraits)])
 def test_a_name_is_taken_once(twin: Rule | Learned) -> None:
     with pytest.raises(ValueError, match="two methods are called 'ttc'"):
         register(twin)

@@ -166,7 +166,7 @@ def test_the_outcome_table_has_intervals_and_the_paper_s_outcomes(report: StudyR
 
 def test_collisions_are_counted_in_a_thousand_cases(report: StudyReport) -> None:
     table = tables(report.markdown)["Who is hit"]
-    assert table[0] == ["method", "aggressive, lower lane"]
+    assert table[0] == ["method", "aggressive, lower"]
     assert table[1] == ["always go", "1000.0"]
     assert table[-1] == ["oracle", f"{1000 * (1 + 1 + 6) / 120:.1f}"]
 

@@ -38,7 +38,7 @@ def test_the_seeds_of_a_method_make_one_row(oracle: Row) -> None:
     assert oracle.episodes == 10
     assert oracle.hits("success").shape == (2, 10)
     assert (oracle.rate("success"), oracle.rate("timeout"), oracle.rate("collision")) == (0.85, 0.1, 0.05)
-    assert oracle.collisions == {"aggressive, lower lane": 1}
+    assert oracle.collisions == {"aggressive, lower": 1}
 
 
 def test_the_time_is_the_mean_of_all_successes(oracle: Row) -> None:
@@ -117,4 +117,4 @@ def test_collisions_are_counted_over_all_seeds() -> None:
     lower, upper = Case("collision", 4.0, "aggressive", "lower"), Case("collision", 4.0, "conservative", "upper")
     evaluations = (Evaluation((lower, lower)), Evaluation((lower, upper)))
     row = Row("oracle", TRAINED, ALL_MIXES, WORLD, (0, 1), evaluations)
-    assert row.collisions == {"aggressive, lower lane": 3, "conservative, upper lane": 1}
+    assert row.collisions == {"aggressive, lower": 3, "conservative, upper": 1}

@@ -3,10 +3,11 @@ import math
 import numpy as np
 import pytest
 
+from tests.simulation.scenes import LOWER
 from tint_sumo.study.rules import CREEP, GO, STOP, AlwaysGo, Observation, TimeToCollision
 
 LOWER_Y_M, UPPER_Y_M = 2.0, 6.0
-AT_LINE_Y_M = -2.6  # of the ego's centre: its front is at y = -0.1, past the stop line
+AT_LINE_Y_M = -2.6  # of the ego's centre: its front is at y = -0.1, past the line where it waits, at -0.5
 STEP_S = 0.1
 
 
@@ -38,11 +39,10 @@ def test_goes_on_an_empty_street() -> None:
     assert act(scene(), scene()) == GO
 
 
-def test_creeps_to_the_stop_line_and_waits_there() -> None:
-    blocking = (2.0, LOWER_Y_M)
-    far, near = (scene(blocking, ego_m=(0.0, y_m)) for y_m in (-5.0, AT_LINE_Y_M))
-    assert act(far, far) == CREEP
-    assert act(near, near) == STOP
+@pytest.mark.parametrize(("y_m", "action"), [(-5.0, CREEP), (-3.1, CREEP), (-2.9, STOP), (AT_LINE_Y_M, STOP)])
+def test_creeps_to_the_line_half_a_metre_before_the_lane_and_waits_there(y_m: float, action: int) -> None:
+    blocked = scene((2.0, LOWER_Y_M), ego_m=(0.0, y_m))
+    assert act(blocked, blocked) == action
 
 
 @pytest.mark.parametrize(("speed_mps", "action"), [(0.0, GO), (2.0, GO), (3.0, STOP)])
@@ -55,8 +55,8 @@ def test_lower_lane_threshold(speed_mps: float, action: int) -> None:
 
 @pytest.mark.parametrize(("speed_mps", "action"), [(0.0, GO), (2.0, GO), (3.0, STOP)])
 def test_upper_lane_threshold(speed_mps: float, action: int) -> None:
-    # Front at x = -2, zone from x = 1.
-    x_m = -4.5
+    # The ego's front is 1 m inside the lane at x = 1.85. Front at x = -2.15, zone from x = 0.85.
+    x_m = -4.65
     before = scene((x_m - speed_mps * STEP_S, UPPER_Y_M))
     assert act(before, scene((x_m, UPPER_Y_M))) == action
 
@@ -66,7 +66,7 @@ def test_a_vehicle_in_the_zone_blocks_though_it_stands() -> None:
     assert act(standing, standing) == STOP
 
 
-@pytest.mark.parametrize("centre_m", [(-0.1, LOWER_Y_M), (-8.0, LOWER_Y_M), (2.1, UPPER_Y_M), (12.0, UPPER_Y_M)])
+@pytest.mark.parametrize("centre_m", [(-0.1, LOWER_Y_M), (-8.0, LOWER_Y_M), (1.9, UPPER_Y_M), (12.0, UPPER_Y_M)])
 def test_a_vehicle_past_the_path_does_not_block(centre_m: tuple[float, float]) -> None:
     passed = scene(centre_m)
     assert act(passed, passed) == GO
@@ -79,7 +79,7 @@ def test_the_threshold_is_a_setting() -> None:
 
 
 def test_on_the_lower_lane_it_looks_at_the_upper_one_only() -> None:
-    before_upper_m = (1.0, 1.4)  # of the ego's centre: its front is close to the upper lane
+    before_upper_m = (0.32, 1.22)  # of the ego's centre: its front is at y = 3.7, 0.37 m before the upper lane
     lower, upper = (scene(vehicle, ego_m=before_upper_m) for vehicle in ((2.0, LOWER_Y_M), (0.0, UPPER_Y_M)))
     assert act(lower, lower) == GO
     assert act(upper, upper) == STOP
@@ -107,9 +107,8 @@ def test_speed_is_not_taken_from_the_ego_s_motion() -> None:
 
 
 def test_times() -> None:
-    x_m = np.array([[6.5, 3.0, -1.0, 6.5]])
-    lower = np.zeros((1, 4), bool)
-    times_s = TimeToCollision().times_s(x_m, lower, np.array([[2.0, 2.0, 2.0, 0.0]]))
+    along_m = 22.5 - np.array([[6.5, 3.0, -1.0, 6.5]])  # of centres at these x
+    times_s = TimeToCollision().times_s(np.full((1, 4), LOWER), along_m, np.array([[2.0, 2.0, 2.0, 0.0]]))
     assert times_s[0].tolist() == pytest.approx([1.5, 0.0, math.inf, math.inf])
 
 
@@ -117,3 +116,9 @@ def test_environments_of_a_batch_do_not_mix() -> None:
     free, blocked = scene(), scene((2.0, LOWER_Y_M))
     both = {key: np.concatenate([free[key], blocked[key], free[key]]) for key in free}
     assert TimeToCollision().predict(both)[0].tolist() == [GO, STOP, GO]
+
+
+@pytest.mark.parametrize("centre_m", [(2.0, LOWER_Y_M), (-0.1, LOWER_Y_M), (0.0, UPPER_Y_M), (2.1, UPPER_Y_M)])
+def test_in_the_mirrored_scene_it_acts_alike(centre_m: tuple[float, float]) -> None:
+    seen, mirrored = scene(centre_m), scene((-centre_m[0], centre_m[1]))
+    assert act(mirrored, mirrored, TimeToCollision(scene="t_intersection_right")) == act(seen, seen)

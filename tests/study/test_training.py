@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 import torch
 
+from tests.simulation.scenes import T
 from tests.study import runs
 from tint_sumo import traits
 from tint_sumo.config import PpoSettings, TraitSettings
@@ -84,6 +85,7 @@ def test_a_run_leaves_a_policy_its_card_its_snapshots_and_its_curve(tmp_path: Pa
     card = json.loads((out / "policy.json").read_text())
     assert (card["method"], card["p_conservative"], card["steps"], card["seed"]) == ("no_labels", [0.25, 0.5], 250, 3)
     assert card["settings"]["n_steps"] == 16
+    assert (card["scene"], card["scene_digest"]) == ("t_intersection", T.digest)
     assert (card["traits"], card["traits_sha256"]) == (None, None)
     assert {"libsumo", "torch", "python"} < set(card["versions"])
     assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
@@ -310,13 +312,13 @@ def test_the_trait_model_travels_with_the_policy(tmp_path: Path, tiny: PpoSettin
 
 def test_another_trait_model_is_another_run(tmp_path: Path, tiny: PpoSettings, trait_model: Path) -> None:
     train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
-    save(traits.METHODS["vae"](SMALL_VAE), trait_model.with_suffix(""), {})
+    save(traits.TRAIT_METHODS["vae"](SMALL_VAE), trait_model.with_suffix(""), {})
     with pytest.raises(InputError, match=r"another run \(different: traits\)"):
         train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
 
 
 def test_a_trait_model_of_another_latent_size_is_refused(tmp_path: Path, tiny: PpoSettings) -> None:
-    save(traits.METHODS["vae"](SMALL_VAE, latent_size=3), tmp_path / "wide", {})
+    save(traits.TRAIT_METHODS["vae"](SMALL_VAE, latent_size=3), tmp_path / "wide", {})
     with pytest.raises(InputError, match="3 latents where 2 are needed"):
         train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=tmp_path / "wide.safetensors")
     assert not (tmp_path / "run").exists()
@@ -348,6 +350,8 @@ def test_a_critic_that_sees_true_traits_is_trained_and_the_policy_drives_without
         "settings": None,
         "trait_size": 5,
         "critic_sees_true_traits": True,
+        "max_vehicles": 12,
+        "actions": 3,
     }
     contender = load_policy(tmp_path)
     assert contender.source is not None and isinstance(contender.source(), StreamingTraits)

@@ -4,13 +4,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.simulation.scenes import T
 from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_labels, load_windows, split_by_episode
 from tint_sumo.errors import InputError
 from tint_sumo.study import trait_models
 from tint_sumo.study.trait_models import evaluate_traits, plot_traits, train_traits
-from tint_sumo.traits import METHODS
+from tint_sumo.traits import TRAIT_METHODS
 from tint_sumo.traits.evaluation import TEST_FRACTION
 from tint_sumo.traits.storage import find, read_card
 
@@ -50,7 +51,14 @@ def test_training_sees_the_training_episodes_only(
     _, test = split_by_episode(windows, TEST_FRACTION, SEED)
     assert set(seen[0].episode).isdisjoint(windows.episode[test])
     assert card["windows"] == len(seen[0]) == len(windows) - len(test)
-    assert card["data"] == {"p_conservative": 0.5, "population": "traits", "seed": 5, "windows": len(windows)}
+    assert card["data"] == {
+        "scene": "t_intersection",
+        "scene_digest": T.digest,
+        "p_conservative": 0.5,
+        "population": "traits",
+        "seed": 5,
+        "windows": len(windows),
+    }
 
 
 def test_evaluation_and_pictures_take_the_episodes_left_out_by_the_model_s_seed(
@@ -102,7 +110,7 @@ def test_noise_makes_evaluation_harder_and_is_repeatable(dataset: Path) -> None:
         evaluate_traits(dataset, "vae", noise_m=-1.0)
 
 
-@pytest.mark.parametrize("method", sorted(METHODS))
+@pytest.mark.parametrize("method", sorted(TRAIT_METHODS))
 def test_every_method_trains_on_a_dataset_and_reports_its_errors(dataset: Path, tmp_path: Path, method: str) -> None:
     train_traits(dataset, tmp_path, method=method, settings=SMALL, seed=SEED, progress=False)
     found = evaluate_traits(dataset, tmp_path)

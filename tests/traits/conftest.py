@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, WINDOW_STEPS, DriverProfile, EpisodeRules, Idm, TraitSettings
-from tint_sumo.dataset.schema import NO_LEADER_GAP_M
+from tint_sumo.config import (
+    AGGRESSIVE,
+    CONSERVATIVE,
+    NO_LEADER_GAP_M,
+    STEP_S,
+    WINDOW_STEPS,
+    DriverProfile,
+    Idm,
+    TraitSettings,
+)
 from tint_sumo.dataset.windows import Windows
 
 VEHICLE_LENGTH_M = 5.0
@@ -47,7 +55,7 @@ def drive(platoons: Platoons, steps: int) -> tuple[NDArray[np.float64], NDArray[
 
     A leader counts while it is on the street; a vehicle without one drives freely.
     """
-    idm, dt = Idm(), EpisodeRules().step_s
+    idm, dt = Idm(), STEP_S
     position, speed = platoons.position_m.copy(), 0.8 * platoons.desired_speed_mps
     frames = []
     for _ in range(steps):

@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tint_sumo.dataset.schema import NO_LEADER_GAP_M
-from tint_sumo.traits.batches import Batch, Siblings, TrainingWindows, add_position_noise
+from tint_sumo.config import NO_LEADER_GAP_M
+from tint_sumo.traits.batches import Siblings, TrainingWindows, WindowBatch, add_position_noise
 
 
 def test_siblings_are_all_the_other_windows_of_the_driver():
@@ -60,7 +60,7 @@ def test_without_a_leader_the_gap_stays_the_one_that_says_so():
 
 def test_no_noise_changes_nothing_and_both_windows_get_their_own():
     states = torch.ones(50, 20, 2)
-    batch = Batch(states, torch.full((50,), 20), Batch(states, torch.full((50,), 20)))
+    batch = WindowBatch(states, torch.full((50,), 20), WindowBatch(states, torch.full((50,), 20)))
     assert batch.with_noise(0.0, torch.Generator()) is batch
     noisy = batch.with_noise(0.1, torch.Generator())
     assert not torch.allclose(noisy.states, noisy.other.states, atol=0.01)

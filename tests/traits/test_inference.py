@@ -11,7 +11,7 @@ from tint_sumo.dataset.schema import TRAJECTORIES
 from tint_sumo.dataset.windows import load_windows
 from tint_sumo.errors import InputError
 from tint_sumo.files import shipped
-from tint_sumo.traits import METHODS, load
+from tint_sumo.traits import TRAIT_METHODS, load
 from tint_sumo.traits.cross_window import fuse
 from tint_sumo.traits.evaluation import encode_windows
 from tint_sumo.traits.inference import infer_traits, write_table
@@ -34,7 +34,7 @@ def cross_window(tmp_path_factory: pytest.TempPathFactory, small: TraitSettings)
     """A model nobody trained, of some uncertainty."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        model = METHODS["cross_window"](small)
+        model = TRAIT_METHODS["cross_window"](small)
     stem = tmp_path_factory.mktemp("model") / "model"
     save(model, stem, {"seed": 0})
     return stem.parent

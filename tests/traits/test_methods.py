@@ -5,17 +5,17 @@ import math
 import pytest
 import torch
 
-from tint_sumo.traits import METHODS, TraitModel
-from tint_sumo.traits.batches import Batch, TrainingWindows
+from tint_sumo.traits import TRAIT_METHODS, TraitModel
+from tint_sumo.traits.batches import TrainingWindows, WindowBatch
 from tint_sumo.traits.model import valid_steps
 
 
-@pytest.fixture(params=sorted(METHODS))
+@pytest.fixture(params=sorted(TRAIT_METHODS))
 def model(request, small, street) -> TraitModel:
     windows, _ = street
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        model = METHODS[request.param](small)
+        model = TRAIT_METHODS[request.param](small)
     model.fit_features(torch.from_numpy(windows.states), torch.from_numpy(windows.length))
     return model.eval()
 
@@ -34,7 +34,7 @@ def spoil(batch, rubbish):
     states = batch.states.clone()
     states[~valid_steps(states, batch.length)] = rubbish
     other = None if batch.other is None else spoil(batch.other, rubbish)
-    return Batch(states, batch.length, other, batch.conservative)
+    return WindowBatch(states, batch.length, other, batch.conservative)
 
 
 @pytest.mark.parametrize("rubbish", [1e6, math.nan])
@@ -76,7 +76,7 @@ def test_every_parameter_learns(model, batch):
 
 def test_windows_of_two_steps_can_be_learnt_from(model, batch):
     states, length = batch.states[:, :2], torch.full((64,), 2)
-    shortest = Batch(states, length, Batch(states, length), batch.conservative)
+    shortest = WindowBatch(states, length, WindowBatch(states, length), batch.conservative)
     total = model.loss(shortest, torch.Generator().manual_seed(1))["total"]
     total.backward()
     assert total.isfinite()

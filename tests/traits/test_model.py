@@ -3,8 +3,8 @@ import torch
 
 from tint_sumo.config import TraitSettings
 from tint_sumo.errors import InputError
-from tint_sumo.traits import METHODS
-from tint_sumo.traits.model import FEATURE_SPREAD, find_method, register
+from tint_sumo.traits import TRAIT_METHODS
+from tint_sumo.traits.model import FEATURE_SPREAD, find_trait_method, register
 from tint_sumo.traits.vae import Vae
 
 
@@ -56,9 +56,9 @@ def test_two_methods_of_one_name_are_refused():
 
     with pytest.raises(ValueError, match="two trait methods are called 'vae'"):
         register(Another)
-    assert METHODS["vae"] is Vae
+    assert TRAIT_METHODS["vae"] is Vae
 
 
 def test_an_unknown_method_is_answered_with_the_known_ones():
     with pytest.raises(InputError, match=r"unknown trait method 'theirs'; choose one of: .*vae"):
-        find_method("theirs")
+        find_trait_method("theirs")

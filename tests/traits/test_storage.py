@@ -6,7 +6,7 @@ import torch
 
 from tint_sumo.errors import InputError
 from tint_sumo.traits import load, storage
-from tint_sumo.traits.model import find_method
+from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.storage import add_to_card, read_card, save
 from tint_sumo.traits.vae import Vae
 
@@ -128,4 +128,4 @@ def test_names_of_the_past_are_answered_with_those_of_today(old, new):
     with pytest.raises(InputError, match=f"^{old} is now called {new}; use that name$"):
         load(old)
     with pytest.raises(InputError, match=f"^{old} is now called {new}; use that name$"):
-        find_method(old)
+        find_trait_method(old)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tint_sumo.errors import InputError
-from tint_sumo.traits import METHODS, load, training
+from tint_sumo.traits import TRAIT_METHODS, load, training
 from tint_sumo.traits.evaluation import evaluate
 from tint_sumo.traits.training import CHECKPOINT_FILE, train
 from tint_sumo.traits.vae import Vae
@@ -131,16 +131,16 @@ def test_large_networks_train_in_bfloat16(windows, small, tmp_path):
 @pytest.mark.parametrize("method", ["classifier", "vae", "cross_window"])  # morton learns nothing from constant speed
 def test_two_populations_separate(small, tmp_path, method):
     windows, slow = two_populations(1000)
-    labels = slow if METHODS[method].uses_labels else None
+    labels = slow if TRAIT_METHODS[method].uses_labels else None
     settings = replace(small, hidden_size=16, learning_rate=1e-2, epochs=8)
     model = train(windows, settings, tmp_path, method=method, conservative=labels, progress=False)
     assert evaluate(model, windows, slow).accuracy > 0.95
 
 
 def test_only_the_classifier_gets_labels(windows, small, tmp_path):
-    assert [name for name, method in METHODS.items() if method.uses_labels] == ["classifier"]
-    for method in METHODS:
-        labels = None if METHODS[method].uses_labels else np.ones(len(windows), bool)
+    assert [name for name, method in TRAIT_METHODS.items() if method.uses_labels] == ["classifier"]
+    for method in TRAIT_METHODS:
+        labels = None if TRAIT_METHODS[method].uses_labels else np.ones(len(windows), bool)
         with pytest.raises(ValueError, match="labels are for the methods that learn with them"):
             train(windows, small, tmp_path / method, method=method, conservative=labels, progress=False)
 

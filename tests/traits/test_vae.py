@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from tint_sumo.traits.batches import Batch
+from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import kl_divergence
 from tint_sumo.traits.model import valid_steps
 from tint_sumo.traits.vae import Vae
@@ -27,7 +27,7 @@ def model(small, batch) -> Vae:
 
 
 def loss_terms(model, states, length) -> dict[str, float]:
-    terms = model.loss(Batch(states, length), torch.Generator().manual_seed(3))
+    terms = model.loss(WindowBatch(states, length), torch.Generator().manual_seed(3))
     return {name: term.item() for name, term in terms.items()}
 
 
@@ -97,5 +97,5 @@ def test_latent_noise_comes_from_the_generator_alone(model, batch):
     first = loss_terms(model, *batch)
     torch.manual_seed(2)
     assert loss_terms(model, *batch) == first
-    other = model.loss(Batch(*batch), torch.Generator().manual_seed(4))["reconstruction"].item()
+    other = model.loss(WindowBatch(*batch), torch.Generator().manual_seed(4))["reconstruction"].item()
     assert other != first["reconstruction"]

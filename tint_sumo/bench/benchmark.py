@@ -21,17 +21,19 @@ import gymnasium
 import numpy as np
 import torch
 
-from tint_sumo import ENV_ID
+from tint_sumo import ENV_IDS
 from tint_sumo.bench.measuring import Clocks, Turn, one_thread, turns_apart
 from tint_sumo.bench.policies import DECISION_METHOD, INSTALL_SB3_CONTRIB, decision_ms, training_speed
-from tint_sumo.config import MAX_VEHICLES, WINDOW_STEPS, PpoSettings
+from tint_sumo.config import WINDOW_STEPS, PpoSettings
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.envs.batch import LocalBatch
-from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.progress import make_bar
-from tint_sumo.simulation.intersections import SUMO_COLLISION_CHECK, Intersections
+from tint_sumo.scenes import T_INTERSECTION, find_scene
+from tint_sumo.simulation.link import SUMO_COLLISION_CHECK
+from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.study.budgets import BUDGETS, TRAIT_BUDGETS
-from tint_sumo.traits import METHODS
+from tint_sumo.traits import TRAIT_METHODS
 from tint_sumo.traits.training import train
 
 BREAKDOWN_METHOD = "clocks around the named functions in a pass of its own, their own cost subtracted"
@@ -42,7 +44,7 @@ _BARE_STEPS = 10  # of SUMO alone: one second, in which few vehicles leave and n
 _CORES_TURNS = 3  # for each of the other measurements: whether two processes run at once depends on what else runs
 _RECORD_WORKERS = 2
 _SAMPLING_S = 0.05
-_ENCODED = 64 * MAX_VEHICLES
+_ENCODED = 64 * 12  # windows: all slots of 64 intersections
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,7 @@ class _Driven:
     """A Stable-Baselines3 environment under random actions."""
 
     def __init__(self, sizes: Sizes, workers: int = 1, seed: int = 0) -> None:
-        self.env = TIntersectionVecEnv(sizes.replicas, seed=seed, workers=workers)
+        self.env = SceneVecEnv(sizes.replicas, seed=seed, workers=workers)
         self._actions = np.random.default_rng(0).integers(3, size=(sizes.turn_steps, sizes.replicas))
         self.env.reset()
         for _ in range(_WARM_UP_STEPS):
@@ -185,6 +187,12 @@ class _Driven:
         batch = self.env.env.batch
         assert isinstance(batch, LocalBatch)
         return batch
+
+    @property
+    def simulation(self) -> Simulation:
+        simulation = self.batch.episodes.simulation
+        assert isinstance(simulation, Simulation)
+        return simulation
 
     def turn(self) -> int:
         """Make a turn's steps and return how many environment steps they were."""
@@ -213,7 +221,7 @@ def _speed(sizes: Sizes) -> dict[str, Any]:
     for turn in range(sizes.turns):
         with _driven(sizes, seed=turn) as driven:
             env.append(driven.steps_per_s())
-            floor.append(_bare_steps_per_s(driven.batch.episodes.simulation))
+            floor.append(_bare_steps_per_s(driven.simulation))
         checking.append(_checking_steps_per_s(sizes, seed=turn))
     return {
         "floor_env_steps_per_s": median(floor),
@@ -224,9 +232,9 @@ def _speed(sizes: Sizes) -> dict[str, Any]:
     }
 
 
-def _bare_steps_per_s(simulation: Intersections) -> float:
+def _bare_steps_per_s(simulation: Simulation) -> float:
     """Steps of SUMO in a row; the simulation loses track of its vehicles and is of no more use."""
-    step = simulation._connection.step
+    step = simulation.link.connection.step
     start = time.perf_counter()
     for _ in range(_BARE_STEPS):
         step()
@@ -236,15 +244,15 @@ def _bare_steps_per_s(simulation: Intersections) -> float:
 def _checking_steps_per_s(sizes: Sizes, seed: int) -> float:
     """The same of a simulation that SUMO checks for collisions, after as many steps of random egos."""
     rng = np.random.default_rng(seed)
-    simulation = Intersections(sizes.replicas, collision_options=SUMO_COLLISION_CHECK)
-    scenario = simulation.scenario
+    scene = find_scene(T_INTERSECTION)
+    simulation = Simulation(sizes.replicas, scene, collision_options=SUMO_COLLISION_CHECK)
     try:
         over = np.ones(sizes.replicas, bool)
         for step in range(_WARM_UP_STEPS + sizes.turn_steps):
             for replica in np.flatnonzero(over).tolist():
                 simulation.reset(replica, [seed, replica, step])
-            simulation.step(rng.choice(scenario.ego.desired_speeds_mps, sizes.replicas))
-            over = simulation.collided | (simulation.ego_pose["x_m"] > scenario.episode.goal_x_m)
+            simulation.step(rng.choice(scene.ego.controller.desired_speeds_mps, sizes.replicas))
+            over = simulation.egos.collided | (simulation.egos.front_m > scene.ego.goal_m)
         return _bare_steps_per_s(simulation)
     finally:
         simulation.close()
@@ -252,16 +260,16 @@ def _checking_steps_per_s(sizes: Sizes, seed: int) -> float:
 
 def _breakdown(sizes: Sizes) -> dict[str, Any]:
     with _driven(sizes) as driven:
-        episodes, simulation = driven.batch.episodes, driven.batch.episodes.simulation
+        episodes, simulation = driven.batch.episodes, driven.simulation
         clocks = Clocks()
-        simulation._connection = replace(
-            simulation._connection, step=clocks.around(simulation._connection.step, "sumo")
-        )
-        clocks.watch(simulation, "_read_positions", "getters")
+        link = simulation.link
+        link.connection = replace(link.connection, step=clocks.around(link.connection.step, "sumo"))
+        clocks.watch(link, "lane_positions_m", "getters")
         clocks.watch(simulation, "_admit", "spawning")
         clocks.watch(simulation, "reset", "spawning")
-        clocks.watch(simulation, "_update_claims", "claims")
-        clocks.watch(simulation, "_check_safety", "safety_check")
+        clocks.watch(simulation.egos, "update_claims", "claims")
+        clocks.watch(simulation.yielding, "answer", "claims")
+        clocks.watch(simulation.egos, "look_around", "safety_check")
         clocks.watch(episodes, "_observe", "observation")
         clocks.watch(episodes, "step", "other")  # driving the egos, rewards, the end of episodes
         clocks.watch(driven.batch, "step", "other")
@@ -272,7 +280,7 @@ def _breakdown(sizes: Sizes) -> dict[str, Any]:
 
 
 def _gym_speed(sizes: Sizes) -> dict[str, Any]:
-    env = gymnasium.make(ENV_ID)
+    env = gymnasium.make(ENV_IDS[T_INTERSECTION])
     actions = np.random.default_rng(0).integers(3, size=sizes.gym_turn_steps)
     env.reset(seed=0)
 
@@ -341,8 +349,8 @@ def _memory(sizes: Sizes) -> dict[str, Any]:
 def _traits(sizes: Sizes) -> dict[str, Any]:
     """Each trait method with the sizes of the full budget and one thread of torch, as in the study's jobs."""
     with one_thread():
-        training = {method: _train_windows_per_s(method, sizes.training_windows) for method in METHODS}
-        encoding = {method: _encode_ms(method, sizes.turns) for method in METHODS}
+        training = {method: _train_windows_per_s(method, sizes.training_windows) for method in TRAIT_METHODS}
+        encoding = {method: _encode_ms(method, sizes.turns) for method in TRAIT_METHODS}
     return {"train_windows_per_s": training, "encode_ms": encoding}
 
 
@@ -351,7 +359,7 @@ def _policies(sizes: Sizes) -> dict[str, Any]:
 
 
 def _train_windows_per_s(method: str, windows: int) -> float:
-    labels = np.arange(windows) % 2 == 0 if METHODS[method].uses_labels else None
+    labels = np.arange(windows) % 2 == 0 if TRAIT_METHODS[method].uses_labels else None
     data = _steady_windows(windows)
     with tempfile.TemporaryDirectory(prefix="tint_sumo.") as folder:
         start = time.perf_counter()
@@ -367,7 +375,7 @@ def _train_windows_per_s(method: str, windows: int) -> float:
 
 
 def _encode_ms(method: str, turns: int) -> float:
-    model = METHODS[method](TRAIT_BUDGETS["full"]).eval()
+    model = TRAIT_METHODS[method](TRAIT_BUDGETS["full"]).eval()
     data = _steady_windows(_ENCODED)
     states, length = torch.from_numpy(data.states), torch.from_numpy(data.length)
     elapsed_ms = []

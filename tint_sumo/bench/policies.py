@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from tint_sumo import traits
 from tint_sumo.bench.measuring import Clocks, Turn, one_thread, turns_apart
 from tint_sumo.config import PpoSettings
-from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy import ActionRepeat, GruPolicy, StreamingTraits, TraitObservation
 from tint_sumo.study.budgets import ALL_MIXES
 from tint_sumo.study.methods import find_learned
@@ -84,7 +84,7 @@ def _contrib_model(venv: VecEnv, seed: int, settings: PpoSettings) -> OnPolicyAl
 
 def decision_ms(settings: PpoSettings, decisions: int) -> float:
     """Median time of a decision (``DECISION_METHOD``) with streaming traits and a network as large as the study's."""
-    env = TIntersectionVecEnv(1, seed=0)
+    env = SceneVecEnv(1, seed=0, tracks=True)
     observed = TraitObservation(env, StreamingTraits(traits.load("cross_window")))
     with closing(ActionRepeat(observed, settings.action_repeat)) as venv, one_thread():
         policy = GruPolicy(venv.observation_space, venv.action_space, lambda _: 0.0, settings=settings.policy)

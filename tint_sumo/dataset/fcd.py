@@ -1,9 +1,10 @@
 """Recorded trajectories as SUMO's floating-car data, for the tools of the SUMO world.
 
-What ``sumo --fcd-output FILE --fcd-output.acceleration`` writes of the same traffic in ``sumo_net/tint.net.xml``, apart
-from three things. Episodes are runs of their own and follow each other at full minutes, so that time increases along a
-file and from file to file. Vehicle ids are ``EPISODE.VEHICLE``, unique in the dataset. And the type is SUMO's default
-one for all: the drivers' own vTypes would tell the trait; they are in ``drivers/`` with the labels.
+What ``sumo --fcd-output FILE --fcd-output.acceleration`` writes of the same traffic in the network that ``tint-sumo
+net`` builds, apart from three things. Episodes are runs of their own and follow each other at full minutes, so that
+time increases along a file and from file to file. Vehicle ids are ``EPISODE.VEHICLE``, unique in the dataset. And the
+type is SUMO's default one for all: the drivers' own vTypes would tell the trait; they are in ``drivers/`` with the
+labels.
 
 Format: https://sumo.dlr.de/docs/Simulation/Output/FCDOutput.html
 """
@@ -16,10 +17,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import Street, VehicleShape
 from tint_sumo.files import whole_file
-from tint_sumo.scenario.geometry import LANE_DIRECTION, LANE_NAMES, lane_y_m, stage_start_m
-from tint_sumo.scenario.network import lane_id
+from tint_sumo.scenes.geometry import POSE, place
+from tint_sumo.scenes.layout import Layout
 
 EPISODE_PERIOD_S = 60.0
 VEHICLE_TYPE = "DEFAULT_VEHTYPE"
@@ -34,7 +34,7 @@ xsi:noNamespaceSchemaLocation="http://sumo.dlr.de/xsd/fcd_file.xsd">
 """
 
 
-def write_fcd(rows: pd.DataFrame, file: Path) -> None:
+def write_fcd(rows: pd.DataFrame, file: Path, layout: Layout) -> None:
     """Write rows of trajectories to a gzipped XML file; the same rows always give the same bytes."""
     with (
         whole_file(file) as partial,
@@ -42,37 +42,39 @@ def write_fcd(rows: pd.DataFrame, file: Path) -> None:
         gzip.GzipFile("", "wb", _GZIP_LEVEL, raw, mtime=0) as xml,
     ):
         xml.write(_HEADER.encode())
-        xml.writelines(timestep.encode() for timestep in _timesteps(rows))
+        xml.writelines(timestep.encode() for timestep in _timesteps(rows, layout))
         xml.write(b"</fcd-export>\n")
 
 
-def _timesteps(rows: pd.DataFrame) -> Iterator[str]:
+def _timesteps(rows: pd.DataFrame, layout: Layout) -> Iterator[str]:
     rows = rows.sort_values(["episode", "time_s", "vehicle"], ignore_index=True)
     time_s = rows["episode"].to_numpy() * EPISODE_PERIOD_S + rows["time_s"].to_numpy(np.float64)
-    time, vehicles = _decimals(time_s), _vehicles(rows)
+    time, vehicles = _decimals(time_s), _vehicles(rows, layout)
     starts = np.flatnonzero(np.r_[True, time[1:] != time[:-1]])
     for start, end in zip(starts, [*starts[1:], len(rows)], strict=True):
         yield f'    <timestep time="{time[start]}">\n{"".join(vehicles[start:end])}    </timestep>\n'
 
 
-def _vehicles(rows: pd.DataFrame) -> list[str]:
+def _vehicles(rows: pd.DataFrame, layout: Layout) -> list[str]:
     """The element of each row."""
-    street, vehicle = Street(), VehicleShape()
-    lane = rows["lane"].cat.set_categories(list(LANE_NAMES)).cat.codes.to_numpy(np.int64)
+    names = [one.name for one in layout.scene.routes]
+    route = rows["route"].cat.set_categories(names).cat.codes.to_numpy(np.int64)
     front_m = rows["position_m"].to_numpy(np.float64)
-    starts_m = stage_start_m(street, vehicle)
-    stage = (front_m[:, None] > starts_m[lane, 1:]).sum(axis=1)
-    x_m = LANE_DIRECTION[lane] * (front_m - street.half_length_m - vehicle.length_m / 2)
-    lanes = np.array([[lane_id(one, part, replica=0) for part in range(3)] for one in range(2)], object)
+    starts_m = layout.lane_start_m
+    stage = (front_m[:, None] > starts_m[route, 1:]).sum(axis=1)
+    lanes = np.full(starts_m.shape, "", object)
+    for number, path in enumerate(layout.routes):
+        lanes[number, : len(path.lanes)] = [lane.format(replica=0) for lane in path.lanes]
+    x_m, y_m, angle_deg = _fronts(front_m, route, layout)
     columns = (
         rows["episode"],
         rows["vehicle"],
         _decimals(x_m),
-        _decimals(lane_y_m(street))[lane],
-        _decimals(90.0 * (2 - LANE_DIRECTION))[lane],  # clockwise from north
+        _decimals(y_m),
+        _decimals(angle_deg),
         _decimals(rows["speed_mps"].to_numpy(np.float64)),
-        _decimals(front_m - starts_m[lane, stage]),
-        lanes[lane, stage],
+        _decimals(front_m - starts_m[route, stage]),
+        lanes[route, stage],
         _decimals(rows["acceleration_mps2"].fillna(0.0).to_numpy(np.float64)),  # as SUMO has it at appearance
     )
     return [
@@ -80,6 +82,22 @@ def _vehicles(rows: pd.DataFrame) -> list[str]:
         f'speed="{speed}" pos="{pos}" lane="{sumo_lane}" slope="0.00" acceleration="{acceleration}"/>\n'
         for episode, number, x, y, angle, speed, pos, sumo_lane, acceleration in zip(*columns, strict=True)
     ]
+
+
+def _fronts(
+    front_m: NDArray[np.float64], route: NDArray[np.integer], layout: Layout
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """x and y of front bumpers, and the vehicles' angles, clockwise from north in degrees; all (M,)."""
+    length_m = layout.scene.vehicle.length_m
+    poses = np.zeros(len(front_m), POSE)
+    for number, way in enumerate(layout.ways):
+        here = route == number
+        placed = np.zeros(int(here.sum()), POSE)
+        place(front_m[here], way, length_m, placed)
+        poses[here] = placed
+    x_m = poses["x_m"] + length_m / 2 * poses["heading_x"]
+    y_m = poses["y_m"] + length_m / 2 * poses["heading_y"]
+    return x_m, y_m, np.degrees(np.arctan2(poses["heading_x"], poses["heading_y"])) % 360.0
 
 
 def _decimals(values: NDArray[np.float64]) -> NDArray[np.object_]:

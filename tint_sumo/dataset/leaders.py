@@ -10,7 +10,7 @@ import pandas as pd
 import sumolib
 from numpy.typing import NDArray
 
-from tint_sumo.dataset.schema import NO_LEADER_GAP_M
+from tint_sumo.config import NO_LEADER_GAP_M
 from tint_sumo.errors import InputError
 
 

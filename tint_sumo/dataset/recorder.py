@@ -10,7 +10,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.metadata import version
 from itertools import count
@@ -23,14 +23,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from tint_sumo.config import MAX_VEHICLES, POPULATIONS, WINDOW_STEPS, Scenario, Share, Traffic
+from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, POPULATIONS, WINDOW_STEPS, Share, Traffic
 from tint_sumo.dataset.fcd import write_fcd
 from tint_sumo.dataset.schema import (
     DRIVER_SCHEMA,
     DRIVERS,
     FCD,
     MANIFEST,
-    NO_LEADER_GAP_M,
     SCHEMA_VERSION,
     TABLES,
     TRAJECTORIES,
@@ -44,12 +43,13 @@ from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, read_json, whole_file, write_json
 from tint_sumo.processes import SPAWN, end_with_parent
 from tint_sumo.progress import make_bar
-from tint_sumo.scenario.geometry import LANE_DIRECTION, LANE_NAMES
-from tint_sumo.simulation.intersections import Intersections
+from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene
+from tint_sumo.scenes.geometry import Floats, Numbers
+from tint_sumo.scenes.layout import layout
+from tint_sumo.simulation.simulation import Simulation
 
 EPISODES_PER_SHARD = 16
 EPISODE_STEPS = 500
-MIN_WINDOW_STEPS = 2  # a single step has no motion
 _WINDOWS_KEY = b"tint_sumo.windows"
 # Measured on real shards, size and write time relative to pyarrow's defaults (snappy, dictionaries): splitting the
 # floats into byte streams halves the file (0.42) and takes a third of the time, as dictionaries of floats that hardly
@@ -66,6 +66,7 @@ class Recording:
     p_conservative: Share = 0.5
     population: str = "traits"  # a name in POPULATIONS
     seed: int = 0
+    scene: str = T_INTERSECTION  # a name in SCENES
 
     def __post_init__(self) -> None:
         if self.windows < 1:
@@ -74,15 +75,18 @@ class Recording:
             raise InputError(f"seed must not be negative: {self.seed}")
         if self.population not in POPULATIONS:
             raise InputError(f"unknown population {self.population!r}; choose one of: {', '.join(POPULATIONS)}")
-        self.scenario()
+        self.played()
 
-    def scenario(self) -> Scenario:
-        return Scenario(Traffic(p_conservative=self.p_conservative), POPULATIONS[self.population])
+    def played(self) -> Scene:
+        traffic, population = Traffic(p_conservative=self.p_conservative), POPULATIONS[self.population]
+        return replace(find_scene(self.scene), traffic=traffic, population=population)
 
     def settings(self) -> dict[str, Any]:
         return {
             "kind": "dataset",
             "schema_version": SCHEMA_VERSION,
+            "scene": self.scene,
+            "scene_digest": self.played().digest,
             "windows": self.windows,
             "p_conservative": self.p_conservative,
             "population": self.population,
@@ -97,6 +101,7 @@ def record(
     p_conservative: Share = 0.5,
     population: str = "traits",
     seed: int = 0,
+    scene: str = T_INTERSECTION,
     workers: int = 1,
     fcd: bool = False,
     progress: bool = True,
@@ -109,7 +114,7 @@ def record(
     Raises:
         InputError: bad values, or ``out`` holds another run.
     """
-    recording = Recording(windows, p_conservative, population, seed)
+    recording = Recording(windows, p_conservative, population, seed, scene)
     if workers < 1:
         raise InputError(f"workers must be at least 1, not {workers}")
     with claim_folder(out, recording.settings()):
@@ -199,7 +204,7 @@ def _manifest(out: Path, recording: Recording, counts: list[int]) -> dict[str, A
         "drivers": rows[DRIVERS],
         "shards": len(counts),
         "episodes": len(counts) * EPISODES_PER_SHARD,
-        "episode_s": EPISODE_STEPS * recording.scenario().episode.step_s,
+        "episode_s": EPISODE_STEPS * recording.played().step_s,
         "versions": {name: version(name) for name in ("tint_sumo", "libsumo", "numpy", "pandas", "pyarrow")}
         | {"python": platform.python_version()},
     }
@@ -211,13 +216,13 @@ def _record_shard(recording: Recording, out: Path, fcd: bool, shard: int) -> int
     if not (file.exists() and shard_file(out, DRIVERS, shard).exists()):
         _record_tables(recording, out, shard)
     if fcd and not shard_file(out, FCD, shard).exists():
-        write_fcd(read_shard(file), shard_file(out, FCD, shard))
+        write_fcd(read_shard(file), shard_file(out, FCD, shard), layout(recording.played()))
     return int(read_shard_metadata(file).metadata[_WINDOWS_KEY])
 
 
 def _record_tables(recording: Recording, out: Path, shard: int) -> None:
     trajectories, drivers = simulate_episodes(
-        _simulation(recording.scenario()), recording.seed, first_episode=shard * EPISODES_PER_SHARD
+        _simulation(recording.played()), recording.seed, first_episode=shard * EPISODES_PER_SHARD
     )
     windows = str(count_windows(trajectories)).encode()
     # The trajectories come last: where they are, the shard's tables are complete.
@@ -226,9 +231,9 @@ def _record_tables(recording: Recording, out: Path, shard: int) -> None:
 
 
 @cache
-def _simulation(scenario: Scenario) -> Intersections:
+def _simulation(scene: Scene) -> Simulation:
     """This process's simulation; starting one for every shard would cost more than recording it."""
-    return Intersections(EPISODES_PER_SHARD, scenario, with_ego=False)
+    return Simulation(EPISODES_PER_SHARD, scene, with_ego=False)
 
 
 def _write(file: Path, frame: pd.DataFrame, schema: pa.Schema, metadata: Mapping[bytes, bytes]) -> None:
@@ -252,24 +257,26 @@ def count_windows(trajectories: pd.DataFrame) -> int:
 
 
 def simulate_episodes(
-    simulation: Intersections, seed: int, first_episode: int, steps: int = EPISODE_STEPS
+    simulation: Simulation, seed: int, first_episode: int, steps: int = EPISODE_STEPS
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Run one episode in every replica; return rows of trajectories (by vehicle and time) and of drivers."""
     replicas = simulation.replicas
     for replica in range(replicas):
         simulation.reset(replica, [seed, first_episode + replica])
-    shape = (steps + 1, replicas, MAX_VEHICLES)
-    front_m = np.empty(shape)
-    number, member, lane = (np.empty(shape, np.int64) for _ in range(3))
+    scene = simulation.scene
+    shape = (steps + 1, replicas, scene.max_vehicles)
+    front_m, gap_m = np.empty(shape), np.empty(shape)
+    number, member, route, leader = (np.empty(shape, np.int64) for _ in range(4))
     for step in range(steps + 1):
         if step > 0:
             simulation.step()
-        front_m[step] = simulation.front_m
-        number[step], member[step], lane[step] = simulation.vehicle_number, simulation.member, simulation.lane
+        slots = simulation.slots
+        front_m[step] = slots.front_m
+        number[step], member[step], route[step] = slots.vehicle_number, slots.member, slots.route
+        leading, gap_m[step] = simulation.leaders()
+        leader[step] = np.where(leading < 0, -1, np.take_along_axis(number[step], leading, axis=1))
     desired_mps = np.array([one.desired_speed_mps for one in simulation.population])[member]
-    step_s, length_m = simulation.scenario.episode.step_s, simulation.scenario.vehicle.length_m
-    speed_mps = _speeds_mps(front_m, number, desired_mps, step_s)
-    leader, gap_m = _leaders(front_m, number, lane, length_m)
+    speed_mps = _speeds_mps(front_m, number, desired_mps, scene.step_s)
 
     when, replica_at, slot = np.nonzero(number >= 0)
     order = np.lexsort((when, number[when, replica_at, slot], replica_at))
@@ -278,12 +285,11 @@ def simulate_episodes(
     trajectories = pd.DataFrame(
         {
             **keys,
-            "time_s": at[0] * step_s,
-            "lane": pd.Categorical.from_codes(lane[at], pd.Index(LANE_NAMES)),
-            "direction": LANE_DIRECTION[lane[at]].astype(np.int8),
+            "time_s": at[0] * scene.step_s,
+            "route": pd.Categorical.from_codes(route[at], pd.Index([one.name for one in scene.routes])),
             "position_m": front_m[at],
             "speed_mps": speed_mps[at],
-            "acceleration_mps2": _accelerations_mps2(speed_mps, number, step_s)[at],
+            "acceleration_mps2": _accelerations_mps2(speed_mps, number, scene.step_s)[at],
             "leader": pd.arrays.IntegerArray(leader[at].astype(np.int16), leader[at] < 0),
             "gap_m": gap_m[at],
         }
@@ -293,7 +299,7 @@ def simulate_episodes(
 
 
 def _driver_rows(
-    simulation: Intersections, keys: Mapping[str, NDArray[np.int64]], member: NDArray[np.int64]
+    simulation: Simulation, keys: Mapping[str, NDArray[np.int64]], member: NDArray[np.int64]
 ) -> pd.DataFrame:
     drivers = [simulation.population[index] for index in member]
     return pd.DataFrame(
@@ -308,12 +314,8 @@ def _driver_rows(
     )
 
 
-Floats = NDArray[np.float64]
-Numbers = NDArray[np.int64]
-
-
 def _continues(number: Numbers) -> NDArray[np.bool_]:
-    """(T, R, 12): the slot held the same vehicle one step before."""
+    """(T, R, V): the slot held the same vehicle one step before."""
     same = np.zeros(number.shape, bool)
     same[1:] = (number[1:] == number[:-1]) & (number[1:] >= 0)
     return same
@@ -330,20 +332,3 @@ def _accelerations_mps2(speed_mps: Floats, number: Numbers, step_s: float) -> Fl
     change = np.full_like(speed_mps, np.nan)
     change[1:] = (speed_mps[1:] - speed_mps[:-1]) / step_s
     return np.where(_continues(number), change, np.nan)
-
-
-def _leaders(front_m: Floats, number: Numbers, lane: Numbers, length_m: float) -> tuple[Numbers, Floats]:
-    """Number of the next vehicle ahead on the lane (-1 if none) and the bumper-to-bumper gap to it (NaN if none)."""
-    lane = np.where(number >= 0, lane, len(LANE_NAMES))  # empty slots queue on a lane of their own
-    order = np.lexsort((front_m, lane))  # of the last axis: lane by lane, front to front
-    behind, ahead = order[..., :-1], order[..., 1:]
-
-    def at(values: NDArray[Any], slot: Numbers) -> NDArray[Any]:
-        return np.take_along_axis(values, slot, axis=-1)
-
-    follows = (at(lane, ahead) == at(lane, behind)) & (at(number, behind) >= 0)
-    leader, gap_m = np.full_like(number, -1), np.full_like(front_m, np.nan)
-    np.put_along_axis(leader, behind, np.where(follows, at(number, ahead), -1), axis=-1)
-    distance_m = at(front_m, ahead) - at(front_m, behind)
-    np.put_along_axis(gap_m, behind, np.where(follows, distance_m - length_m, np.nan), axis=-1)
-    return leader, gap_m

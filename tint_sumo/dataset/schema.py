@@ -13,19 +13,15 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tint_sumo.config import Street
 from tint_sumo.errors import InputError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"
 TRAJECTORIES = "trajectories"
 DRIVERS = "drivers"
 TABLES = (TRAJECTORIES, DRIVERS)
 FCD = "fcd"
 _SUFFIX = {TRAJECTORIES: "parquet", DRIVERS: "parquet", FCD: "xml.gz"}
-
-# Stands for the gap of every driver without a leader, whatever the driver's trait, and caps all gaps: half the street.
-NO_LEADER_GAP_M = Street().half_length_m
 
 
 def _field(name: str, dtype: pa.DataType, unit: str, meaning: str, nullable: bool = False) -> pa.Field:
@@ -41,12 +37,11 @@ TRAJECTORY_SCHEMA = pa.schema(
     [
         *_KEYS,
         _field("time_s", pa.float32(), "s", "since the episode's start"),
-        _field("lane", pa.dictionary(pa.int8(), pa.string()), "1", "lower or upper"),
-        _field("direction", pa.int8(), "1", "sign of the velocity along x: -1 west, 1 east"),
-        _field("position_m", pa.float32(), "m", "front bumper's distance along the lane"),
+        _field("route", pa.dictionary(pa.int8(), pa.string()), "1", "name of the route in the scene"),
+        _field("position_m", pa.float32(), "m", "front bumper's distance along the route"),
         _field("speed_mps", pa.float32(), "m/s", "over the last step; at appearance the insertion speed"),
         _field("acceleration_mps2", pa.float32(), "m/s2", "over the last step; null at appearance", nullable=True),
-        _field("leader", pa.int16(), "1", "vehicle ahead on the lane; null if none", nullable=True),
+        _field("leader", pa.int16(), "1", "vehicle ahead on the route; null if none", nullable=True),
         _field("gap_m", pa.float32(), "m", "bumper to bumper to the leader; null if none", nullable=True),
     ]
 )

@@ -6,14 +6,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import EpisodeRules, VehicleShape
+from tint_sumo.config import STEP_S, VehicleShape
 from tint_sumo.dataset.fcd import EPISODE_PERIOD_S
 from tint_sumo.dataset.fcd_reading import read_fcd
 from tint_sumo.dataset.leaders import Lanes, gaps_m
 from tint_sumo.dataset.schema import TRAJECTORIES, read_shard, read_shard_metadata
 from tint_sumo.errors import InputError
 
-STEP_S = EpisodeRules().step_s
 MAX_STEP_S = 1.0  # a straight line between farther points would be no driving any more
 _POS_DIGIT_M = 0.01  # SUMO's default precision
 _OWN_COLUMNS = ("episode", "vehicle", "time_s", "position_m", "gap_m")

@@ -1,7 +1,7 @@
 """Windows of up to 20 steps for learning traits, from a recorded dataset. Labels are loaded apart."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import WINDOW_STEPS
-from tint_sumo.dataset.recorder import MIN_WINDOW_STEPS
-from tint_sumo.dataset.schema import DRIVERS, MANIFEST, NO_LEADER_GAP_M, SCHEMA_VERSION, TRAJECTORIES
+from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, WINDOW_STEPS
+from tint_sumo.dataset.schema import DRIVERS, MANIFEST, SCHEMA_VERSION, TRAJECTORIES
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
 
 _DRIVERS_PER_EPISODE = 100_000
+_MANIFEST_KEYS = ("rows", "drivers", "windows", "seed", "scene", "scene_digest", "p_conservative", "population")
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,17 @@ def cut_windows(
     ]
 
 
+def joined(parts: Sequence[Windows]) -> Windows:
+    """All windows of several datasets, whose drivers and episodes are told apart."""
+    first = np.cumsum([0, *(part.episode.max(initial=0) + 1 for part in parts)])
+    moved = [
+        replace(part, driver=part.driver + start * _DRIVERS_PER_EPISODE, episode=part.episode + start)
+        for part, start in zip(parts, first.tolist(), strict=False)
+    ]
+    columns = {field.name: np.concatenate([getattr(one, field.name) for one in moved]) for field in fields(Windows)}
+    return Windows(**columns)
+
+
 def steps_in_window(driver: NDArray[np.int64]) -> NDArray[np.int64]:
     """How many steps of its window precede each row (M,), the rows sorted by driver and time."""
     starts_track = np.r_[True, driver[1:] != driver[:-1]]
@@ -125,7 +136,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             f"{folder} has dataset schema version {found}, this tint_sumo reads {SCHEMA_VERSION}; record it anew"
         )
     missing = [
-        key for key in ("rows", "drivers", "windows", "seed", "p_conservative", "population") if key not in manifest
+        key
+        for key in ("rows", "drivers", "windows", "seed", "scene", "scene_digest", "p_conservative", "population")
+        if key not in manifest
     ]
     if missing:
         raise InputError(f"{folder / MANIFEST} is damaged (no {', '.join(missing)}); record the dataset anew")

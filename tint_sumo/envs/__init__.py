@@ -1,6 +1,6 @@
 """Gymnasium environments; those for Stable-Baselines3 stand in ``tint_sumo.envs.sb3``, which loads torch."""
 
-from tint_sumo.envs.t_intersection import TIntersectionEnv
-from tint_sumo.envs.vector import TIntersectionVectorEnv
+from tint_sumo.envs.scene_env import SceneEnv
+from tint_sumo.envs.vector import SceneVectorEnv
 
-__all__ = ["TIntersectionEnv", "TIntersectionVectorEnv"]
+__all__ = ["SceneEnv", "SceneVectorEnv"]

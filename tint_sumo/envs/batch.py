@@ -9,8 +9,8 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from tint_sumo.envs.episodes import Episodes, TaskSettings
-from tint_sumo.envs.rendering import render_intersection
-from tint_sumo.envs.rows import OBSERVATION_KEYS, OUTCOMES, Observation, Rows
+from tint_sumo.envs.rendering import render_scene
+from tint_sumo.envs.rows import Rows, outcome_name
 
 
 @dataclass(frozen=True)
@@ -18,11 +18,12 @@ class Ended:
     """How an environment's episode ended, as seen before its next one began in the same step."""
 
     index: int
-    observation: Observation
-    traits: NDArray[np.int8]
-    outcome: str
-    time_s: float
+    row: np.void  # what it told
     collision: dict[str, Any]  # empty without one
+
+    @property
+    def outcome(self) -> str:
+        return outcome_name(self.row["outcome"])
 
 
 class Batch(Protocol):
@@ -45,7 +46,7 @@ class Batch(Protocol):
 
 
 class LocalBatch:
-    """A batch in this process: intersections of one simulation."""
+    """A batch in this process: replicas of one simulation."""
 
     def __init__(self, num_envs: int, settings: TaskSettings, rows: Rows | None = None) -> None:
         self.episodes = Episodes(num_envs, settings, rows)
@@ -76,19 +77,11 @@ class LocalBatch:
             self.episodes.simulation.clear(index)
 
     def _ended(self, index: int) -> Ended:
-        row = self.rows[index].copy()
-        return Ended(
-            index,
-            {key: row[key] for key in OBSERVATION_KEYS},
-            row["traits"],
-            OUTCOMES[row["outcome"]],
-            float(row["time_s"]),
-            self.episodes.collision_info(index),
-        )
+        return Ended(index, self.rows[index].copy(), self.episodes.collision_info(index))
 
     def render(self) -> list[NDArray[np.uint8]]:
         simulation = self.episodes.simulation
-        return [render_intersection(simulation, index) for index in range(simulation.replicas)]
+        return [render_scene(simulation, index) for index in range(simulation.replicas)]
 
     def close(self) -> None:
         self.episodes.simulation.close()

@@ -8,75 +8,89 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from tint_sumo.config import (
-    MAX_VEHICLES,
-    POSITION_SCALE_M,
-    REWARD_PRESETS,
-    SPEED_SCALE_MPS,
-    Backend,
-    EgoController,
-    EpisodeRules,
-    Idm,
-    Population,
-    Scenario,
-    Share,
-    Traffic,
-)
-from tint_sumo.envs.rows import BOUND, ROW, Rows, Scales, TaskRules, judge, observe
+from tint_sumo.config import POSITION_SCALE_M, REWARD_PRESETS, SPEED_SCALE_MPS, Backend, Idm, Share
+from tint_sumo.envs.rows import BOUND, NOBODY, TRACKS, Rows, Scales, TaskRules, judge, observe, observe_tracks, row_type
 from tint_sumo.errors import InputError
-from tint_sumo.scenario.geometry import Floats
-from tint_sumo.simulation.intersections import Intersections
+from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, find_scene
+from tint_sumo.scenes.geometry import Floats
+from tint_sumo.simulation.own import make_simulation
 
 _SEED_LIMIT = 2**63
-_ACTIONS_MPS = EgoController().desired_speeds_mps
 
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """The arguments of the environments' constructors."""
+    """The arguments of all environments; :class:`~tint_sumo.envs.scene_env.SceneEnv` explains them.
 
-    p_conservative: Share = 0.4
+    Raises:
+        InputError: a value makes no sense.
+    """
+
+    scene: str | Scene | OwnScene = T_INTERSECTION
+    p_conservative: Share | None = None
     reward: str = "paper"
-    time_limit_s: float = 50.0
+    time_limit_s: float | None = None
     position_noise_m: float = 0.0
     tau_s: float = Idm.tau_s
+    tracks: bool = False
     backend: Backend = "auto"
 
     def __post_init__(self) -> None:
         if self.reward not in REWARD_PRESETS:
             raise InputError(f"unknown reward preset {self.reward!r}; choose one of {', '.join(REWARD_PRESETS)}")
-        if not EpisodeRules().step_s <= self.time_limit_s < math.inf:
-            raise InputError(f"time_limit_s must be at least a step of 0.1 s, and finite, not {self.time_limit_s}")
         if not 0.0 <= self.position_noise_m < math.inf:
             raise InputError(f"position_noise_m must be finite and not negative, not {self.position_noise_m}")
-
-        if not EpisodeRules().step_s <= self.tau_s < math.inf:
-            raise InputError(f"tau_s must be at least a step of 0.1 s, and finite, not {self.tau_s}")
+        scene = self.played
+        if not scene.step_s <= scene.time_limit_s < math.inf:
+            raise InputError(
+                f"time_limit_s must be at least a step of {scene.step_s:g} s, and finite, not {scene.time_limit_s}"
+            )
+        if isinstance(scene, Scene) and not scene.step_s <= self.tau_s < math.inf:
+            raise InputError(f"tau_s must be at least a step of {scene.step_s:g} s, and finite, not {self.tau_s}")
 
     @property
-    def scenario(self) -> Scenario:
-        rules = replace(EpisodeRules(), time_limit_s=self.time_limit_s)
-        population = replace(Population(), idm=replace(Idm(), tau_s=self.tau_s))
-        return Scenario(Traffic(p_conservative=self.p_conservative), population, episode=rules)
+    def slot_infos(self) -> tuple[str, ...]:
+        """What is told of each vehicle slot beside the observation."""
+        return ("traits", *TRACKS) if self.tracks else ("traits",)
+
+    @property
+    def played(self) -> Scene | OwnScene:
+        """The scene with these settings in place of its own."""
+        scene = find_scene(self.scene) if isinstance(self.scene, str) else self.scene
+        if isinstance(scene, OwnScene):
+            return self._own(scene)
+        population = replace(scene.population, idm=replace(scene.population.idm, tau_s=self.tau_s))
+        traffic, time_limit_s = scene.traffic, scene.time_limit_s
+        if self.p_conservative is not None:
+            traffic = replace(traffic, p_conservative=self.p_conservative)
+        if self.time_limit_s is not None:
+            time_limit_s = self.time_limit_s
+        return replace(scene, traffic=traffic, population=population, time_limit_s=time_limit_s)
+
+    def _own(self, scene: OwnScene) -> OwnScene:
+        if self.p_conservative is not None or self.tau_s != Idm.tau_s:
+            raise InputError("the demand of a .sumocfg tells who drives how; leave p_conservative and tau_s out")
+        return scene if self.time_limit_s is None else replace(scene, time_limit_s=self.time_limit_s)
 
 
-def action_space() -> spaces.Discrete:
-    return spaces.Discrete(len(_ACTIONS_MPS))
+def action_space(scene: Scene | OwnScene) -> spaces.Discrete:
+    return spaces.Discrete(len(scene.ego.controller.desired_speeds_mps))
 
 
-def observation_space() -> spaces.Dict:
+def observation_space(max_vehicles: int) -> spaces.Dict:
     return spaces.Dict(
         {
             "ego": spaces.Box(-BOUND, BOUND, (4,), np.float32),
-            "vehicles": spaces.Box(-BOUND, BOUND, (MAX_VEHICLES, 2), np.float32),
-            "mask": spaces.Box(0.0, 1.0, (MAX_VEHICLES,), np.float32),
+            "vehicles": spaces.Box(-BOUND, BOUND, (max_vehicles, 2), np.float32),
+            "mask": spaces.Box(0.0, 1.0, (max_vehicles,), np.float32),
         }
     )
 
 
-def require_actions(actions: NDArray[np.integer], num_envs: int) -> None:
-    if actions.shape != (num_envs,) or not ((actions >= 0) & (actions < len(_ACTIONS_MPS))).all():
-        raise InputError(f"actions must be {num_envs} of 0, 1, 2, not {actions.tolist()}")
+def require_actions(actions: NDArray[np.integer], num_envs: int, choices: int) -> None:
+    if actions.shape != (num_envs,) or not ((actions >= 0) & (actions < choices)).all():
+        allowed = ", ".join(map(str, range(choices)))
+        raise InputError(f"actions must be {num_envs} of {allowed}, not {actions.tolist()}")
 
 
 def episode_seed(rng: np.random.Generator) -> int:
@@ -93,16 +107,16 @@ class Episodes:
 
     def __init__(self, num_envs: int, settings: TaskSettings, rows: Rows | None = None) -> None:
         self.settings = settings
-        self.simulation = Intersections(num_envs, settings.scenario, backend=settings.backend)
-        self.rows = np.zeros(num_envs, ROW) if rows is None else rows
-        traits = [1 if member.profile.yields else -1 for member in self.simulation.population]
-        self._trait_of_member = np.array([*traits, 0], np.int8)  # the last: empty slots
-        self._rules = TaskRules.of(settings.scenario, REWARD_PRESETS[settings.reward])
-        self._scales = Scales(POSITION_SCALE_M, SPEED_SCALE_MPS, settings.scenario.episode.step_s)
-        self._speeds_mps = np.array(_ACTIONS_MPS)
+        scene = settings.played
+        self.simulation = make_simulation(num_envs, scene, settings.backend)
+        self.rows = np.zeros(num_envs, row_type(scene.max_vehicles)) if rows is None else rows
+        self._trait_of_member = np.array([*self.simulation.trait_of_member, NOBODY], np.int8)  # the last: empty slots
+        self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
+        self._scales = Scales(POSITION_SCALE_M, SPEED_SCALE_MPS, scene.step_s)
+        self._speeds_mps = np.array(scene.ego.controller.desired_speeds_mps)
         self.steps = np.zeros(num_envs, np.int64)
         self._noise: dict[int, np.random.Generator] = {}  # of each environment, where there is noise
-        self._noise_m: Floats = np.zeros((num_envs, MAX_VEHICLES, 2))
+        self._noise_m: Floats = np.zeros((num_envs, scene.max_vehicles, 2))
 
     def begin(self, index: int, rng: np.random.Generator) -> None:
         """Start a new episode drawn from an environment's generator."""
@@ -114,37 +128,54 @@ class Episodes:
         self._observe(slice(index, index + 1))
 
     def step(self, actions: NDArray[np.integer]) -> bool:
-        """Take an action, 0, 1 or 2, in each environment; (N,). Tells whether any episode has ended."""
+        """Take an action, the number of a desired speed, in each environment; (N,). Whether any episode has ended."""
         simulation = self.simulation
         simulation.step(self._speeds_mps[actions])
         self.steps += 1
         self._observe(slice(0, len(self.steps)))
-        return judge(
-            simulation.ego_pose, simulation.ego_speed_mps, simulation.collided, self.steps, self._rules, self.rows
-        )
+        egos = simulation.egos
+        return judge(egos.front_m, egos.speed_mps, egos.collided, self.steps, self._rules, self.rows)
 
     def _observe(self, envs: slice) -> None:
         """Write the observations of some environments, each with noise from its own generator."""
-        simulation = self.simulation
+        egos, slots = self.simulation.egos, self.simulation.slots
         for index in self._noise.keys() & range(envs.start, envs.stop):
-            rng = self._noise[index]
-            self._noise_m[index] = rng.normal(0.0, self.settings.position_noise_m, (MAX_VEHICLES, 2))
+            noise = self._noise[index].normal(0.0, self.settings.position_noise_m, self._noise_m.shape[1:])
+            self._noise_m[index] = noise
         observe(
-            simulation.ego_pose[envs],
-            simulation.ego_speed_mps[envs],
-            simulation.present[envs],
-            simulation.x_m[envs],
-            simulation.y_m[envs],
-            self._trait_of_member[simulation.member[envs]],
+            egos.pose[envs],
+            egos.speed_mps[envs],
+            slots.present[envs],
+            slots.pose[envs],
+            self._trait_of_member[slots.member[envs]],
             self._noise_m[envs],
             self.steps[envs],
             self._scales,
             self.rows[envs],
         )
+        if self.settings.tracks:
+            self._observe_tracks(envs)
+
+    def _observe_tracks(self, envs: slice) -> None:
+        egos, slots = self.simulation.egos, self.simulation.slots
+        leader, gap_m = self.simulation.leaders(envs)
+        observe_tracks(
+            egos.front_m[envs],
+            self.simulation.passed_m,
+            slots.present[envs],
+            slots.route[envs],
+            slots.pose[envs],
+            slots.front_m[envs],
+            leader,
+            gap_m,
+            self._noise_m[envs],
+            self.rows[envs],
+        )
 
     def collision_info(self, index: int) -> dict[str, Any]:
         """Who was hit where; empty without a collision."""
-        event = self.simulation.collision[index]
+        event = self.simulation.egos.collision[index]
         if event is None:
             return {}
-        return {"trait": event.profile, "lane": event.lane, "slot": event.slot, "ego_m": (event.ego_x_m, event.ego_y_m)}
+        trait = self.simulation.traits[self.simulation.trait_of_member[event.member]]
+        return {"trait": trait, "route": event.route, "slot": event.slot, "ego_m": (event.ego_x_m, event.ego_y_m)}

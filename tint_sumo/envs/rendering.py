@@ -1,19 +1,30 @@
-"""Top view of one intersection."""
+"""Top view of one replica of a scene."""
+
+from functools import cache
+from pathlib import Path
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from tint_sumo.config import Street
 from tint_sumo.errors import InputError
-from tint_sumo.scenario.geometry import LANE_DIRECTION
-from tint_sumo.simulation.intersections import Intersections
+from tint_sumo.scenes import View
+from tint_sumo.scenes.geometry import SPACING_M, Floats
+from tint_sumo.scenes.layout import Layout
+from tint_sumo.scenes.own import read_net
+from tint_sumo.simulation.own import OwnSimulation
+from tint_sumo.simulation.simulation import Simulation
 
 RENDER_FPS = 10
-_PIXELS_PER_M = 16
+_WIDTH = 736  # pixels
 _OVERSAMPLING = 3  # the image is drawn larger and scaled down, for smooth edges
-_LEFT_M, _RIGHT_M, _BOTTOM_M, _TOP_M = -23.0, 23.0, -10.0, 10.0
+_DASH_M, _LINE_M = 1.0, 0.12
 _GRASS, _ROAD, _LINE, _EGO, _GLASS = "#e9efe3", "#8f959b", "#ffffff", (240, 180, 0), "#2b2f33"
+_AROUND_M = (30.0, 20.0)  # what is shown of a network of one's own, to each side of the ego
+_SEAM_M = 0.06  # half of the line between two lanes
+# Of vTypes, by their numbers; those that follow begin again.
+_VTYPES = ((40, 90, 200), (200, 40, 40), (30, 140, 70), (130, 60, 170), (220, 110, 20), (20, 150, 170), (90, 90, 90))
 
 
 def require_render_mode(render_mode: str | None) -> None:
@@ -21,70 +32,104 @@ def require_render_mode(render_mode: str | None) -> None:
         raise InputError(f"unknown render_mode {render_mode!r}; choose None or 'rgb_array'")
 
 
-def render_intersection(simulation: Intersections, replica: int) -> NDArray[np.uint8]:
+def render_scene(simulation: Simulation | OwnSimulation, replica: int) -> NDArray[np.uint8]:
     """Draw one replica as an (H, W, 3) image."""
-    canvas = _Canvas()
-    _draw_street(canvas, simulation.scenario.street)
-    shape = simulation.scenario.vehicle
-    for slot in np.flatnonzero(simulation.present[replica]):
-        profile = simulation.population[simulation.member[replica, slot]].profile
-        direction = float(LANE_DIRECTION[simulation.lane[replica, slot]])
+    if isinstance(simulation, OwnSimulation):
+        return _render_own(simulation)
+    canvas = _Canvas(simulation.scene.view, _background(simulation.layout).copy())
+    slots, shape = simulation.slots, simulation.scene.vehicle
+    for slot in np.flatnonzero(slots.present[replica]).tolist():
+        profile = simulation.population[slots.member[replica, slot]].profile
         colour = tuple(int(part) for part in profile.colour.split(","))
-        centre = (simulation.x_m[replica, slot], simulation.y_m[replica, slot])
-        canvas.vehicle(centre, (direction, 0.0), shape.length_m, shape.width_m, colour)
-    pose = simulation.ego_pose[replica]
-    heading = (pose["heading_x"], pose["heading_y"])
-    canvas.vehicle((pose["x_m"], pose["y_m"]), heading, shape.length_m, shape.width_m, _EGO)
+        canvas.vehicle(slots.pose[replica, slot], shape.length_m, shape.width_m, colour)
+    canvas.vehicle(simulation.egos.pose[replica], shape.length_m, shape.width_m, _EGO)
     return canvas.image()
 
 
-def _draw_street(canvas: "_Canvas", street: Street) -> None:
-    half = street.lane_width_m / 2
-    middle = street.lower_y_m + half
-    canvas.box(_LEFT_M, street.lower_y_m - half, _RIGHT_M, street.upper_y_m + half, _ROAD)
-    canvas.box(-half, _BOTTOM_M, half, street.lower_y_m, _ROAD)
-    for x_m in np.arange(_LEFT_M, _RIGHT_M, 2.0):
-        canvas.box(x_m, middle - 0.06, x_m + 1.0, middle + 0.06, _LINE)
+def _render_own(simulation: OwnSimulation) -> NDArray[np.uint8]:
+    """The surroundings of the ego in a network of one's own."""
+    ego, slots = simulation.egos.pose[0], simulation.slots
+    x_m, y_m, across_m, up_m = float(ego["x_m"]), float(ego["y_m"]), *_AROUND_M
+    view = View(x_m - across_m, y_m - up_m, x_m + across_m, y_m + up_m)
+    canvas = _Canvas(view)
+    roads = _network_roads(simulation.scene.config.net_file)
+    corners_m = np.array([[view.left_m, view.bottom_m], [view.right_m, view.top_m]]) + simulation.origin_m
+    for road in roads.geometries[roads.query(shapely.box(*corners_m.reshape(-1)))]:
+        canvas.fill(shapely.transform(road, lambda points_m: points_m - simulation.origin_m), _ROAD)
+    for slot in np.flatnonzero(slots.present[0]).tolist():
+        colour = _VTYPES[slots.member[0, slot] % len(_VTYPES)]
+        canvas.vehicle(slots.pose[0, slot], slots.length_m[0, slot], slots.width_m[0, slot], colour)
+    canvas.vehicle(ego, simulation.scene.vehicle.length_m, simulation.scene.vehicle.width_m, _EGO)
+    return canvas.image()
+
+
+@cache
+def _network_roads(net_file: Path) -> shapely.STRtree:
+    """The areas of all lanes and junctions."""
+    net = read_net(net_file, with_internal=False)
+    lanes = [lane for edge in net.getEdges(withInternal=False) for lane in edge.getLanes()]
+    paved = [
+        shapely.LineString(lane.getShape()).buffer(max(lane.getWidth() / 2 - _SEAM_M, _SEAM_M), cap_style="flat")
+        for lane in lanes
+    ]
+    outlines = [node.getShape() for node in net.getNodes() if len(node.getShape()) > 2]
+    return shapely.STRtree([*paved, *(shapely.Polygon(outline).buffer(_SEAM_M) for outline in outlines)])
+
+
+@cache
+def _background(layout: Layout) -> Image.Image:
+    """The empty roads."""
+    canvas = _Canvas(layout.scene.view)
+    canvas.fill(layout.roads, _ROAD)
+    half_m, dash = layout.scene.network.lane_width_m / 2, round(_DASH_M / SPACING_M)
+    for route in layout.routes:
+        middle = route.way[: round(route.length_m / SPACING_M)]
+        step = np.gradient(middle, axis=0)
+        across = np.stack([-step[:, 1], step[:, 0]], axis=-1) / np.hypot(*step.T)[:, None] * half_m
+        for border in (middle + across, middle - across):
+            for start in range(0, len(border) - dash, 2 * dash):
+                line = shapely.linestrings(border[start : start + dash + 1 : 10])
+                canvas.fill(shapely.buffer(line, _LINE_M / 2, cap_style="flat"), _LINE)
+    return canvas.drawing
 
 
 class _Canvas:
-    def __init__(self) -> None:
-        scale = _PIXELS_PER_M * _OVERSAMPLING
-        size = (int((_RIGHT_M - _LEFT_M) * scale), int((_TOP_M - _BOTTOM_M) * scale))
-        self._scale = scale
-        self._image = Image.new("RGB", size, _GRASS)
-        self._draw = ImageDraw.Draw(self._image)
+    def __init__(self, view: View, drawing: Image.Image | None = None) -> None:
+        self._left_m, self._top_m = view.left_m, view.top_m
+        self._scale = _WIDTH / (view.right_m - view.left_m) * _OVERSAMPLING
+        size = (_WIDTH * _OVERSAMPLING, round((view.top_m - view.bottom_m) * self._scale))
+        self.drawing = drawing or Image.new("RGB", size, _GRASS)
+        self._draw = ImageDraw.Draw(self.drawing)
 
-    def _pixel(self, x_m: float, y_m: float) -> tuple[float, float]:
-        return (x_m - _LEFT_M) * self._scale, (_TOP_M - y_m) * self._scale
+    def _pixels(self, points_m: Floats) -> list[tuple[float, float]]:
+        across, down = (points_m[:, 0] - self._left_m) * self._scale, (self._top_m - points_m[:, 1]) * self._scale
+        return list(zip(across.tolist(), down.tolist(), strict=True))
 
-    def box(self, left_m: float, bottom_m: float, right_m: float, top_m: float, colour: str) -> None:
-        self._draw.rectangle((*self._pixel(left_m, top_m), *self._pixel(right_m, bottom_m)), fill=colour)
+    def fill(self, shape: shapely.Geometry, colour: str | tuple[int, ...]) -> None:
+        for part in shapely.get_parts(shape):
+            self._draw.polygon(self._pixels(shapely.get_coordinates(part.exterior)), fill=colour)
+            for hole in part.interiors:
+                self._draw.polygon(self._pixels(shapely.get_coordinates(hole)), fill=_GRASS)
 
-    def vehicle(
-        self,
-        centre_m: tuple[float, float],
-        heading: tuple[float, float],
-        length_m: float,
-        width_m: float,
-        colour: tuple[int, ...],
-    ) -> None:
+    def vehicle(self, pose: np.void, length_m: float, width_m: float, colour: tuple[int, ...]) -> None:
         """A box with its windscreen towards the front."""
+        centre = np.array([pose["x_m"], pose["y_m"]])
+        ahead = np.array([pose["heading_x"], pose["heading_y"]])
+        abreast = np.array([-ahead[1], ahead[0]])
 
-        def polygon(back: float, front: float, half_width: float) -> list[tuple[float, float]]:
-            corners = ((back, -half_width), (front, -half_width), (front, half_width), (back, half_width))
-            return [
-                self._pixel(
-                    centre_m[0] + along * heading[0] - across * heading[1],
-                    centre_m[1] + along * heading[1] + across * heading[0],
-                )
-                for along, across in corners
-            ]
+        def box(back_m: float, front_m: float, half_width_m: float) -> list[tuple[float, float]]:
+            corners = (
+                (back_m, -half_width_m),
+                (front_m, -half_width_m),
+                (front_m, half_width_m),
+                (back_m, half_width_m),
+            )
+            return self._pixels(np.array([centre + along * ahead + across * abreast for along, across in corners]))
 
-        half_length, half_width = length_m / 2, width_m / 2
-        self._draw.polygon(polygon(-half_length, half_length, half_width), fill=colour)
-        self._draw.polygon(polygon(0.16 * length_m, 0.3 * length_m, 0.8 * half_width), fill=_GLASS)
+        half_length_m, half_width_m = length_m / 2, width_m / 2
+        self._draw.polygon(box(-half_length_m, half_length_m, half_width_m), fill=colour)
+        self._draw.polygon(box(0.16 * length_m, 0.3 * length_m, 0.8 * half_width_m), fill=_GLASS)
 
     def image(self) -> NDArray[np.uint8]:
-        width, height = (side // _OVERSAMPLING for side in self._image.size)
-        return np.asarray(self._image.resize((width, height), Image.Resampling.LANCZOS))
+        width, height = (side // _OVERSAMPLING for side in self.drawing.size)
+        return np.asarray(self.drawing.resize((width, height), Image.Resampling.LANCZOS))

@@ -1,45 +1,61 @@
 """What each environment has to tell after a step: one record, written by compiled code."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.compiling import compiled
-from tint_sumo.config import MAX_VEHICLES, RewardPreset, Scenario
-from tint_sumo.scenario.geometry import Bools, Floats, Poses
+from tint_sumo.config import RewardPreset
+from tint_sumo.scenes.geometry import Bools, Floats, Numbers, Poses
+from tint_sumo.scenes.own import OwnScene
+from tint_sumo.scenes.scene import Scene
 
 Observation = dict[str, NDArray[np.float32]]
 OBSERVATION_KEYS = ("ego", "vehicles", "mask")
+TRACKS = ("position_m", "gap_m", "passed")  # of each vehicle slot, where they are asked for
 REWARD_TERMS = ("goal", "collision", "speed", "step")
-OUTCOMES = ("", "success", "collision", "timeout")
-_GOING_ON, _SUCCESS, _COLLISION, _TIMEOUT = range(4)
+OUTCOMES = ("success", "timeout", "collision")
+_GOING_ON, _SUCCESS, _TIMEOUT, _COLLISION = range(4)  # in rows: positions in OUTCOMES, plus 1
+NOBODY = -1  # the trait of an empty slot
 BOUND = 2.0  # of normalised observations: 40 m, 6 m/s
 
-ROW = np.dtype(
-    [
-        ("ego", np.float32, (4,)),
-        ("vehicles", np.float32, (MAX_VEHICLES, 2)),
-        ("mask", np.float32, (MAX_VEHICLES,)),
-        ("traits", np.int8, (MAX_VEHICLES,)),
-        ("time_s", np.float64),
-        ("outcome", np.int64),  # index into OUTCOMES
-        ("terminated", np.bool_),
-        ("truncated", np.bool_),
-        ("reward", np.float64),
-        *((term, np.float64) for term in REWARD_TERMS),
-    ],
-    align=True,
-)
-Rows = NDArray[np.void]  # of ROW, (N,)
+Rows = NDArray[np.void]  # of a type of rows, (N,)
+
+
+def row_type(max_vehicles: int) -> np.dtype[np.void]:
+    """What one environment tells of itself and of so many vehicle slots."""
+    slots = (max_vehicles,)
+    return np.dtype(
+        [
+            ("ego", np.float32, (4,)),
+            ("vehicles", np.float32, (max_vehicles, 2)),
+            ("mask", np.float32, slots),
+            ("traits", np.int8, slots),  # number of the driver's profile, or NOBODY
+            ("position_m", np.float64, slots),  # along the route, as observed; 0 in empty slots
+            ("gap_m", np.float64, slots),  # to the leader, as observed; infinite without one
+            ("passed", np.int8, slots),  # 1 where the ego has left the vehicle's route behind
+            ("time_s", np.float64),
+            ("outcome", np.int64),
+            ("terminated", np.bool_),
+            ("truncated", np.bool_),
+            ("reward", np.float64),
+            *((term, np.float64) for term in REWARD_TERMS),
+        ],
+        align=True,
+    )
+
+
+def outcome_name(code: int) -> str:
+    """Of a row's outcome; empty while the episode goes on."""
+    return OUTCOMES[code - 1] if code else ""
 
 
 class TaskRules(NamedTuple):
     """When an episode ends, and what a step is worth."""
 
-    goal_x_m: float  # the ego's centre past it, and
-    goal_y_m: float  # this close to the upper lane's middle, is a success
-    goal_margin_m: float
+    goal_m: float  # the ego's front past it is a success
     step_limit: int
     goal: float
     collision: float
@@ -47,13 +63,10 @@ class TaskRules(NamedTuple):
     step: float
 
     @classmethod
-    def of(cls, scenario: Scenario, preset: RewardPreset) -> "TaskRules":
-        rules, street = scenario.episode, scenario.street
+    def of(cls, scene: Scene | OwnScene, preset: RewardPreset) -> "TaskRules":
         return cls(
-            rules.goal_x_m,
-            street.upper_y_m,
-            street.lane_width_m / 4,
-            round(rules.time_limit_s / rules.step_s),
+            scene.ego.goal_m,
+            round(scene.time_limit_s / scene.step_s),
             preset.goal,
             preset.collision,
             preset.speed_weight_per_mps,
@@ -62,22 +75,19 @@ class TaskRules(NamedTuple):
 
 
 @compiled
-def judge(
-    poses: Poses, speed_mps: Floats, collided: Bools, steps: NDArray[np.int64], rules: TaskRules, rows: Rows
-) -> bool:
+def judge(front_m: Floats, speed_mps: Floats, collided: Bools, steps: Numbers, rules: TaskRules, rows: Rows) -> bool:
     """Write outcomes and rewards of the step just made (paper IV-A); whether any episode has ended.
 
     Args:
-        poses, speed_mps, collided: (N,) of the egos.
+        front_m, speed_mps, collided: (N,) of the egos.
         steps: (N,) since the episodes' start.
     """
     any_ended = False
     for index in range(len(rows)):
-        row, pose = rows[index], poses[index]
-        arrived = pose.x_m > rules.goal_x_m and abs(pose.y_m - rules.goal_y_m) < rules.goal_margin_m
+        row = rows[index]
         if collided[index]:
             row.outcome = _COLLISION
-        elif arrived:
+        elif front_m[index] > rules.goal_m:
             row.outcome = _SUCCESS
         else:
             row.outcome = _TIMEOUT if steps[index] >= rules.step_limit else _GOING_ON
@@ -107,44 +117,79 @@ def _bounded(value: float) -> float:
 
 @compiled
 def observe(
-    poses: Poses,
+    egos: Poses,
     speed_mps: Floats,
     present: Bools,
-    x_m: Floats,
-    y_m: Floats,
+    vehicles: Poses,
     traits: NDArray[np.int8],
     noise_m: Floats,
-    steps: NDArray[np.int64],
+    steps: Numbers,
     scales: Scales,
     rows: Rows,
 ) -> None:
-    """Write observations, normalised and bounded, and what goes with them.
+    """Write observations, normalised and bounded, and the true traits that go with them.
 
     Args:
-        poses, speed_mps: (N,) of the egos.
-        present, x_m, y_m: (N, 12) of the vehicle slots.
-        traits: (N, 12) true traits.
-        noise_m: (N, 12, 2) of the positions.
+        egos, speed_mps: (N,).
+        present, vehicles: (N, V) of the vehicle slots.
+        traits: (N, V).
+        noise_m: (N, V, 2) of the positions.
         steps: (N,) since the episodes' start.
     """
     for index in range(len(rows)):
-        row, pose = rows[index], poses[index]
+        row, ego = rows[index], egos[index]
         speed = speed_mps[index] / scales.speed_mps
         row.time_s = steps[index] * scales.step_s
-        row.ego[0] = _bounded(pose.x_m / scales.position_m)
-        row.ego[1] = _bounded(pose.y_m / scales.position_m)
-        row.ego[2] = _bounded(speed * pose.heading_x)
-        row.ego[3] = _bounded(speed * pose.heading_y)
+        row.ego[0] = _bounded(ego.x_m / scales.position_m)
+        row.ego[1] = _bounded(ego.y_m / scales.position_m)
+        row.ego[2] = _bounded(speed * ego.heading_x)
+        row.ego[3] = _bounded(speed * ego.heading_y)
         for slot in range(present.shape[1]):
-            there = present[index, slot]
-            dx_m = x_m[index, slot] - pose.x_m + noise_m[index, slot, 0]
-            dy_m = y_m[index, slot] - pose.y_m + noise_m[index, slot, 1]
+            there, other = present[index, slot], vehicles[index, slot]
+            dx_m = other.x_m - ego.x_m + noise_m[index, slot, 0]
+            dy_m = other.y_m - ego.y_m + noise_m[index, slot, 1]
             row.vehicles[slot, 0] = _bounded(dx_m / scales.position_m) if there else 0.0
             row.vehicles[slot, 1] = _bounded(dy_m / scales.position_m) if there else 0.0
             row.mask[slot] = 1.0 if there else 0.0
             row.traits[slot] = traits[index, slot]
 
 
+@compiled
+def observe_tracks(
+    ego_front_m: Floats,
+    passed_m: Floats,
+    present: Bools,
+    route: Numbers,
+    vehicles: Poses,
+    front_m: Floats,
+    leader: Numbers,
+    gap_m: Floats,
+    noise_m: Floats,
+    rows: Rows,
+) -> None:
+    """Write where the vehicles are seen on their routes, with the same noise as in the observations.
+
+    Args:
+        ego_front_m: (N,).
+        passed_m: (K,) see :class:`~tint_sumo.scenes.layout.ConflictZones`.
+        present, route, vehicles, front_m, leader, gap_m: (N, V) of the vehicle slots.
+        noise_m: (N, V, 2) of the positions.
+    """
+    for index in range(len(rows)):
+        row = rows[index]
+        for slot in range(present.shape[1]):
+            there, own, ahead = present[index, slot], vehicles[index, slot], leader[index, slot]
+            own_noise_m = noise_m[index, slot, 0] * own.heading_x + noise_m[index, slot, 1] * own.heading_y
+            row.position_m[slot] = front_m[index, slot] + own_noise_m if there else 0.0
+            row.gap_m[slot] = math.inf
+            if ahead >= 0:
+                other = vehicles[index, ahead]
+                row.gap_m[slot] = gap_m[index, slot] - own_noise_m
+                row.gap_m[slot] += noise_m[index, ahead, 0] * other.heading_x
+                row.gap_m[slot] += noise_m[index, ahead, 1] * other.heading_y
+            row.passed[slot] = there and ego_front_m[index] > passed_m[route[index, slot]]
+
+
 def copied(rows: Rows) -> dict[str, NDArray[Any]]:
     """Arrays (N, ...) of their own for each field."""
-    return {field: rows[field].copy() for field in ROW.names or ()}
+    return {field: rows[field].copy() for field in rows.dtype.names or ()}

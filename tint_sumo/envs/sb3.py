@@ -8,19 +8,24 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from tint_sumo.envs.vector import TIntersectionVectorEnv
+from tint_sumo.envs.vector import SceneVectorEnv
 
 
-class TIntersectionVecEnv(VecEnv):
-    """Stable-Baselines3 ``VecEnv`` of ``num_envs`` intersections in one simulation.
+class SceneVecEnv(VecEnv):
+    """Stable-Baselines3 ``VecEnv`` of ``num_envs`` replicas of a scene in one simulation.
 
-    Takes the arguments of :class:`~tint_sumo.envs.t_intersection.TIntersectionEnv`. ``infos[i]`` holds ``traits``, the
+    Takes the arguments of :class:`~tint_sumo.envs.scene_env.SceneEnv`. ``infos[i]`` holds ``traits``, the
     true traits that go with the returned observation; when an episode ends also ``terminal_observation``,
-    ``TimeLimit.truncated``, ``terminal_traits``, ``outcome``, ``time_s`` and, after a collision, ``collision``.
+    ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``time_s`` and, after a collision, ``collision``.
+    ``slots`` holds arrays (N, V) of what else is known of the vehicles in the returned observations, and
+    ``terminal_slots`` the same of the terminal one: ``traits``, and with ``tracks`` also ``position_m``, ``gap_m`` and
+    ``passed``.
     """
 
+    slots: dict[str, NDArray[Any]]
+
     def __init__(self, num_envs: int, seed: int | None = None, **settings: Any) -> None:
-        self.env = TIntersectionVectorEnv(num_envs, **settings)
+        self.env = SceneVectorEnv(num_envs, **settings)
         super().__init__(num_envs, self.env.single_observation_space, self.env.single_action_space)
         self._actions: NDArray[np.int64] = np.zeros(num_envs, np.int64)
         if seed is not None:
@@ -31,6 +36,7 @@ class TIntersectionVecEnv(VecEnv):
         observation, infos = self.env.reset(seed=seeds)
         self._reset_seeds()
         self._reset_options()
+        self.slots = {key: infos[key] for key in self.env.slot_infos}
         self.reset_infos = [{"traits": traits} for traits in infos["traits"]]
         return observation
 
@@ -40,13 +46,14 @@ class TIntersectionVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         observation, reward, terminated, truncated, infos = self.env.step(self._actions)
         done = terminated | truncated
+        self.slots = {key: infos[key] for key in self.env.slot_infos}
         listed: list[dict[str, Any]] = [{"traits": traits, "outcome": ""} for traits in infos["traits"]]
         for index in np.flatnonzero(done).tolist():
             final = infos["final_info"]
             listed[index] |= {
                 "terminal_observation": infos["final_obs"][index],
                 "TimeLimit.truncated": bool(truncated[index]),
-                "terminal_traits": final["traits"][index],
+                "terminal_slots": {key: final[key][index] for key in self.env.slot_infos},
                 "outcome": str(final["outcome"][index]),
                 "time_s": float(final["time_s"][index]),
             }
@@ -61,7 +68,7 @@ class TIntersectionVecEnv(VecEnv):
         return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        raise NotImplementedError("the intersections share one simulation; give settings to the constructor")
+        raise NotImplementedError("the environments share one simulation; give settings to the constructor")
 
     def env_method(
         self,
@@ -72,16 +79,14 @@ class TIntersectionVecEnv(VecEnv):
     ) -> list[Any]:
         """``"park"`` alone: empty environments, so that they cost next to nothing until the next reset of all."""
         if method_name != "park":
-            raise NotImplementedError(
-                "the intersections share one simulation and have no methods of their own but park"
-            )
+            raise NotImplementedError("the environments share one simulation and have no methods of their own but park")
         parked = list(self._get_indices(indices))
         self.env.batch.park(np.isin(np.arange(self.num_envs), parked))
         return [None for _ in parked]
 
     def env_is_wrapped(
         self,
-        wrapper_class: type[Any],  # noqa: ARG002 - the intersections are never wrapped one by one
+        wrapper_class: type[Any],  # noqa: ARG002 - the environments are never wrapped one by one
         indices: VecEnvIndices = None,
     ) -> list[bool]:
         return [False for _ in self._get_indices(indices)]

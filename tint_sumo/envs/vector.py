@@ -1,24 +1,25 @@
-"""The vector environment: all environments are intersections of one simulation."""
+"""The vector environment: all environments are replicas of a scene in one simulation."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from tint_sumo.config import Backend, Idm, Share
 from tint_sumo.envs.batch import Batch, Ended, LocalBatch
 from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space, require_actions
 from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, copied
 from tint_sumo.envs.workers import WorkerBatch
 from tint_sumo.errors import InputError
+from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
 
 
-class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
-    """``num_envs`` times :class:`~tint_sumo.envs.t_intersection.TIntersectionEnv`, whose docstring is the manual.
+class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
+    """``num_envs`` times :class:`~tint_sumo.envs.scene_env.SceneEnv`, whose docstring is the manual.
 
     Environment ``i`` seeded with ``seed + i`` lives through exactly the episodes of a single environment with that
     seed, whatever ``num_envs`` is. A finished episode is followed by the next one in the same step
@@ -40,25 +41,22 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
     def __init__(
         self,
         num_envs: int = 1,
-        p_conservative: Share = 0.4,
-        reward: str = "paper",
-        time_limit_s: float = 50.0,
-        position_noise_m: float = 0.0,
-        tau_s: float = Idm.tau_s,
-        backend: Backend = "auto",
+        scene: str | Scene | OwnScene = T_INTERSECTION,
         render_mode: str | None = None,
         workers: int = 1,
+        **task: Any,
     ) -> None:
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, not {num_envs}")
         if not 1 <= workers <= num_envs:
             raise InputError(f"workers must be 1 to num_envs = {num_envs}, not {workers}")
         require_render_mode(render_mode)
-        settings = TaskSettings(p_conservative, reward, time_limit_s, position_noise_m, tau_s, backend)
+        settings = TaskSettings(scene, **task)
         self.num_envs = num_envs
+        self.slot_infos = settings.slot_infos
         self.render_mode = render_mode
-        self.single_observation_space = observation_space()
-        self.single_action_space = action_space()
+        self.single_observation_space = observation_space(settings.played.max_vehicles)
+        self.single_action_space: spaces.Discrete = action_space(settings.played)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.batch: Batch = LocalBatch(num_envs, settings) if workers == 1 else WorkerBatch(num_envs, settings, workers)
@@ -84,7 +82,7 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         self, actions: NDArray[np.int64]
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         actions = np.asarray(actions)
-        require_actions(actions, self.num_envs)
+        require_actions(actions, self.num_envs, int(self.single_action_space.n))
         ended = self.batch.step(actions)
         rows = copied(self.batch.rows)
         infos = self._infos(rows)
@@ -95,20 +93,22 @@ class TIntersectionVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
 
     def _infos(self, rows: dict[str, NDArray[Any]]) -> dict[str, Any]:
         outcome = np.full(self.num_envs, "")  # an episode that ended has been followed by the next
-        return self._everywhere({"traits": rows["traits"], "outcome": outcome, "time_s": rows["time_s"]})
+        slots = {key: rows[key] for key in self.slot_infos}
+        return self._everywhere({**slots, "outcome": outcome, "time_s": rows["time_s"]})
 
     def _final(self, infos: dict[str, Any], ended: list[Ended]) -> dict[str, Any]:
         """The last observation and info of the episodes that ended."""
         final_obs, collision = (np.full(self.num_envs, None, dtype=object) for _ in range(2))
         done, collided = (np.zeros(self.num_envs, bool) for _ in range(2))
-        traits, time_s = infos["traits"].copy(), infos["time_s"].copy()
-        outcome = infos["outcome"].astype("U9")
+        told = (*self.slot_infos, "time_s")
+        final = {key: infos[key].copy() for key in told} | {"outcome": infos["outcome"].astype("U9")}
         for one in ended:
             done[one.index], collided[one.index] = True, bool(one.collision)
-            final_obs[one.index], collision[one.index] = one.observation, one.collision
-            traits[one.index], outcome[one.index], time_s[one.index] = one.traits, one.outcome, one.time_s
-        final_info = infos | {"traits": traits, "outcome": outcome, "time_s": time_s}
-        final_info |= _masked({"collision": collision}, collided)
+            final_obs[one.index] = {key: one.row[key] for key in OBSERVATION_KEYS}
+            collision[one.index], final["outcome"][one.index] = one.collision, one.outcome
+            for key in told:
+                final[key][one.index] = one.row[key]
+        final_info = infos | final | _masked({"collision": collision}, collided)
         return _masked({"final_obs": final_obs, "final_info": final_info}, done)
 
     def _everywhere(self, values: dict[str, Any]) -> dict[str, Any]:

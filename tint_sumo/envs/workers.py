@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Ended, LocalBatch
 from tint_sumo.envs.episodes import TaskSettings
-from tint_sumo.envs.rows import ROW, Rows
+from tint_sumo.envs.rows import Rows, row_type
 from tint_sumo.errors import InputError
 from tint_sumo.processes import SPAWN, start_worker
 from tint_sumo.simulation.connection import libsumo_is_free
@@ -40,7 +40,7 @@ class WorkerBatch:
     """
 
     def __init__(self, num_envs: int, settings: TaskSettings, workers: int) -> None:
-        shared = _Shared(num_envs, workers)
+        shared = _Shared(num_envs, workers, settings.played.max_vehicles)
         bounds = [num_envs * worker // workers for worker in range(workers + 1)]
         self._shares = [slice(*share) for share in pairwise(bounds)]
         self.rows = shared.rows
@@ -142,11 +142,12 @@ class _Shared:
     It has no name in the file system: nothing is left of it when the last process ends, however it ends.
     """
 
-    def __init__(self, num_envs: int, workers: int) -> None:
+    def __init__(self, num_envs: int, workers: int, max_vehicles: int) -> None:
         self._num_envs = num_envs
         self._workers = workers
+        self._row = row_type(max_vehicles)
         self._rows_at = 2 * workers * _INTEGER.itemsize
-        self._memory = SPAWN.RawArray("B", self._rows_at + num_envs * ROW.itemsize)
+        self._memory = SPAWN.RawArray("B", self._rows_at + num_envs * self._row.itemsize)
 
     @property
     def sent(self) -> NDArray[np.int64]:
@@ -155,7 +156,7 @@ class _Shared:
 
     @property
     def rows(self) -> Rows:
-        return np.frombuffer(self._memory, ROW, self._num_envs, self._rows_at)
+        return np.frombuffer(self._memory, self._row, self._num_envs, self._rows_at)
 
 
 class _Line:

@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from tint_sumo.config import PolicySettings
-from tint_sumo.envs.episodes import action_space, observation_space
+from tint_sumo.envs.episodes import observation_space
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, whole_file, write_json
 from tint_sumo.policy.network import GruPolicy
@@ -28,18 +28,20 @@ def save_policy(policy: GruPolicy, stem: Path, card: Mapping[str, Any]) -> None:
     """Write ``stem``.safetensors and ``stem``.json; the card comes last, so that where there is one there are weights.
 
     Args:
-        policy: for observations of a T-intersection with traits.
+        policy: for observations of a scene with traits.
         stem: path without suffix.
         card: what else is worth knowing: method, training, results.
     """
     space = policy.observation_space
-    assert isinstance(space, spaces.Dict)
+    assert isinstance(space, spaces.Dict) and isinstance(policy.action_space, spaces.Discrete)
     traits_shape = space[TRAITS].shape
     assert traits_shape is not None
     network = {
         "settings": asdict(policy.settings),
         "trait_size": traits_shape[-1],
         "critic_sees_true_traits": TRUE_TRAITS in space.spaces,
+        "max_vehicles": traits_shape[0],
+        "actions": int(policy.action_space.n),
     }
     with whole_file(weights_file(stem)) as partial:
         partial.write_bytes(safetensors.torch.save(_own_weights(policy)))  # save_model would hide it from others
@@ -99,7 +101,9 @@ def _build(network: Mapping[str, Any]) -> GruPolicy:
     settings: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in network["settings"].items()
     }
-    parts = {**observation_space().spaces, TRAITS: trait_space(network["trait_size"])}
+    slots = network["max_vehicles"]
+    parts = {**observation_space(slots).spaces, TRAITS: trait_space(slots, network["trait_size"])}
     if network["critic_sees_true_traits"]:
-        parts[TRUE_TRAITS] = trait_space(OracleTraits.size)
-    return GruPolicy(spaces.Dict(parts), action_space(), lambda _: 0.0, settings=PolicySettings(**settings))
+        parts[TRUE_TRAITS] = trait_space(slots, OracleTraits.size)
+    actions = spaces.Discrete(network["actions"])
+    return GruPolicy(spaces.Dict(parts), actions, lambda _: 0.0, settings=PolicySettings(**settings))

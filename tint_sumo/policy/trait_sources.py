@@ -2,47 +2,47 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
 
-from tint_sumo.config import LATENT_SIZE, MAX_VEHICLES, POSITION_SCALE_M, WINDOW_STEPS, EpisodeRules
+from tint_sumo.config import LATENT_SIZE, NO_LEADER_GAP_M, STEP_S, WINDOW_STEPS
+from tint_sumo.dataset.windows import cut_windows
 from tint_sumo.errors import InputError
-from tint_sumo.policy.tracks import (
-    LANE_BORDER_Y_M,
-    Observation,
-    Tracks,
-    along_m,
-    centres_m,
-    is_upper,
-    leader_gaps,
-    windows,
-)
 from tint_sumo.traits.classifier import Classifier
 from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.model import TraitModel
 from tint_sumo.traits.streaming import TrackStream
 
+Observation = dict[str, np.ndarray]
+
 
 @dataclass(frozen=True)
 class Frame:
-    """What N environments show at one time."""
+    """What N environments show at one time, of V vehicle slots each."""
 
     observation: Observation  # arrays (N, ...)
-    infos: list[dict[str, Any]]  # N of them
+    slots: dict[str, np.ndarray]  # arrays (N, V), see :class:`tint_sumo.envs.sb3.SceneVecEnv`
     done: np.ndarray  # (N,) bool, whether the last step ended the episode
+
+    @property
+    def present(self) -> np.ndarray:
+        """(N, V) bool, which slots hold a vehicle."""
+        present: np.ndarray = self.observation["mask"] > 0.5
+        return present
 
 
 class TraitSource(ABC):
-    """Where the traits of N environments' vehicles come from; ``traits`` is (N, 12, size) float32."""
+    """Where the traits of N environments' vehicles come from; ``traits`` is (N, V, size) float32."""
 
-    size: ClassVar[int] = LATENT_SIZE  # numbers per vehicle
+    size: int = LATENT_SIZE  # numbers per vehicle
+    needs_tracks: ClassVar[bool] = False  # whether it takes where vehicles are seen on their routes
     traits: np.ndarray
 
-    def attach(self, num_envs: int) -> None:
-        """Get ready for ``num_envs`` environments."""
-        self.traits = np.zeros((num_envs, MAX_VEHICLES, self.size), np.float32)
+    def attach(self, num_envs: int, max_vehicles: int) -> None:
+        """Get ready for ``num_envs`` environments of so many slots."""
+        self.traits = np.zeros((num_envs, max_vehicles, self.size), np.float32)
 
     @abstractmethod
     def begin(self, frame: Frame) -> None:
@@ -62,21 +62,19 @@ class NoTraits(TraitSource):
 
 
 class OracleTraits(TraitSource):
-    """The true traits, known at once: conservative (1, 0), aggressive (0, 1), no vehicle (0, 0)."""
+    """The true traits, known at once: 1 at the number of the driver's profile, conservative first; else 0."""
 
     def begin(self, frame: Frame) -> None:
-        for env in np.flatnonzero(frame.done):
-            self.traits[env] = _one_hot(frame.infos[env]["traits"])
+        self.traits[frame.done] = one_hot(frame.slots["traits"][frame.done], self.size)
 
     def advance(self, frame: Frame) -> None:
-        keys = np.where(frame.done, "terminal_traits", "traits")
-        labels = [info[key] for info, key in zip(frame.infos, keys, strict=True)]
-        self.traits[:] = _one_hot(np.stack(labels))
+        self.traits[:] = one_hot(frame.slots["traits"], self.size)
 
 
-def _one_hot(labels: np.ndarray) -> np.ndarray:
-    """(...) of +1 conservative, -1 aggressive, 0 nobody, to (..., 2)."""
-    return np.stack([labels > 0, labels < 0], axis=-1).astype(np.float32)
+def one_hot(labels: np.ndarray, size: int) -> np.ndarray:
+    """Numbers of profiles (...), -1 for nobody, to (..., size)."""
+    hot: np.ndarray = (labels[..., None] == np.arange(size)).astype(np.float32)
+    return hot
 
 
 class Encoder(Protocol):
@@ -93,9 +91,9 @@ class EncoderTraits(TraitSource):
 
     Traits are zero for an episode's first 20 steps; then, every 20 steps, they are the encoder's mean for the last 20
     steps, or as many (at least 2) as a vehicle has been seen. Drivers in a lane the ego has passed keep their trait
-    (paper III-C): the lower lane counts as passed once the ego's centre is beyond its upper border, y > 4 m; the upper
-    lane, in which the ego ends, never is. (The authors' code has y > 2.23 m and y > 6 m in this frame.) A slot is zero
-    as soon as its vehicle has left.
+    (paper III-C): a lane counts as passed once the ego's centre is beyond its far border, and one that the ego merges
+    into never. In the T-intersection that is y > 4 m for the lower lane (the authors' code has y > 2.23 m and y > 6 m
+    in this frame). A slot is zero as soon as its vehicle has left.
 
     Args:
         model: trait model.
@@ -105,47 +103,54 @@ class EncoderTraits(TraitSource):
         InputError: the model's traits do not have 2 numbers.
     """
 
+    needs_tracks = True
+
     def __init__(self, model: Encoder, scale: float = 1.0) -> None:
         _require_latent_size(model)
         self.model = model
         self.scale = scale
 
-    def attach(self, num_envs: int) -> None:
-        super().attach(num_envs)
+    def attach(self, num_envs: int, max_vehicles: int) -> None:
+        super().attach(num_envs, max_vehicles)
+        shape = (num_envs, WINDOW_STEPS, max_vehicles)  # the last steps of each environment, in a ring
         self._steps = np.zeros(num_envs, np.int64)
-        self._history = Tracks.empty(num_envs)
+        self._present = np.zeros(shape, bool)
+        self._position_m, self._gap_m = np.zeros(shape), np.zeros(shape)
 
     def begin(self, frame: Frame) -> None:
         self._steps[frame.done] = 0
         self.traits[frame.done] = 0.0
-        self._history.present[frame.done] = False
-        self._record(frame.observation, np.flatnonzero(frame.done))
+        self._present[frame.done] = False
+        self._record(frame, np.flatnonzero(frame.done))
 
     def advance(self, frame: Frame) -> None:
         self._steps += 1
-        self._record(frame.observation, np.arange(len(self._steps)))
-        self.traits[frame.observation["mask"] <= 0.5] = 0.0
+        self._record(frame, np.arange(len(self._steps)))
+        self.traits[~frame.present] = 0.0
         due = np.flatnonzero(self._steps % WINDOW_STEPS == 0)
         if len(due):
-            self._infer(due, frame.observation["ego"][due, 1] * POSITION_SCALE_M)
+            self._infer(due, frame.slots["passed"][due] == 0)
 
-    def _record(self, observation: Observation, envs: np.ndarray) -> None:
+    def _record(self, frame: Frame, envs: np.ndarray) -> None:
         """Overwrite the oldest step; a window that is due thus lies in the order of time."""
         at = (self._steps[envs] - 1) % WINDOW_STEPS
-        self._history.x_m[envs, at], self._history.y_m[envs, at] = centres_m(observation, envs)
-        self._history.present[envs, at] = observation["mask"][envs] > 0.5
+        self._present[envs, at] = frame.present[envs]
+        self._position_m[envs, at] = frame.slots["position_m"][envs]
+        self._gap_m[envs, at] = frame.slots["gap_m"][envs]
 
-    def _infer(self, envs: np.ndarray, ego_y_m: np.ndarray) -> None:
-        tracks = self._history.of(envs)
-        states, length = windows(tracks)
-        ahead = is_upper(tracks.y_m[:, -1]) | (ego_y_m <= LANE_BORDER_Y_M)[:, None]
-        rows, slots = np.nonzero((length >= 2) & ahead)
-        if len(rows):
+    def _infer(self, envs: np.ndarray, ahead: np.ndarray) -> None:
+        """Infer anew the traits of the drivers (K, V) that are still ahead, in some environments (K,)."""
+        seen = np.logical_and.accumulate(self._present[envs, ::-1], axis=1)[:, ::-1]  # without a break up to now
+        env, slot, step = np.nonzero((seen & ahead[:, None]).swapaxes(1, 2))
+        if not len(env):
+            return
+        at = (envs[env], step, slot)
+        windows = cut_windows(env * ahead.shape[1] + slot, env, self._position_m[at], self._gap_m[at])
+        if len(windows):
+            row, column = np.divmod(windows.driver, ahead.shape[1])
             with torch.no_grad():
-                mean, _ = self.model.encode(
-                    torch.from_numpy(states[rows, slots]), torch.from_numpy(length[rows, slots])
-                )
-            self.traits[envs[rows], slots] = self._told(mean) / self.scale
+                mean, _ = self.model.encode(torch.from_numpy(windows.states), torch.from_numpy(windows.length))
+            self.traits[envs[row], column] = self._told(mean) / self.scale
 
     def _told(self, latents: torch.Tensor) -> np.ndarray:
         """The numbers that stand for latents (M, 2)."""
@@ -163,7 +168,7 @@ class ClassifierTraits(EncoderTraits):
 
     def _told(self, latents: torch.Tensor) -> np.ndarray:
         is_conservative = self.model.logit(latents).cpu().numpy() > 0.0
-        return _one_hot(np.where(is_conservative, 1, -1))
+        return one_hot(np.where(is_conservative, 0, 1), self.size)
 
 
 class StreamingTraits(TraitSource):
@@ -178,6 +183,7 @@ class StreamingTraits(TraitSource):
     """
 
     size = 2 * LATENT_SIZE + 1
+    needs_tracks = True
 
     def __init__(self, model: TraitModel) -> None:
         _require_latent_size(model)
@@ -188,27 +194,27 @@ class StreamingTraits(TraitSource):
             )
         self.model = model
 
-    def attach(self, num_envs: int) -> None:
-        super().attach(num_envs)
-        self._stream = TrackStream(self.model, num_envs * MAX_VEHICLES)
+    def attach(self, num_envs: int, max_vehicles: int) -> None:
+        super().attach(num_envs, max_vehicles)
+        self._tracks = np.arange(num_envs * max_vehicles).reshape(num_envs, max_vehicles)
+        self._stream = TrackStream(self.model, self._tracks.size)
 
     def begin(self, frame: Frame) -> None:
         envs = np.flatnonzero(frame.done)
-        self._stream.forget((envs[:, None] * MAX_VEHICLES + np.arange(MAX_VEHICLES)).flatten())
-        self._follow(frame.observation, envs)
+        self._stream.forget(self._tracks[envs].flatten())
+        self._follow(frame, envs)
 
     def advance(self, frame: Frame) -> None:
-        self._follow(frame.observation, np.arange(len(frame.done)))
+        self._follow(frame, np.arange(len(frame.done)))
 
-    def _follow(self, observation: Observation, envs: np.ndarray) -> None:
+    def _follow(self, frame: Frame, envs: np.ndarray) -> None:
         """Take one more step of the tracks in some environments."""
-        present = observation["mask"][envs] > 0.5
-        x_m, y_m = centres_m(observation, envs)
-        gap_m = leader_gaps(x_m, y_m, present)
-        tracks = envs[:, None] * MAX_VEHICLES + np.arange(MAX_VEHICLES)
+        present, tracks = frame.present[envs], self._tracks[envs]
+        position_m = frame.slots["position_m"][envs].astype(np.float32)
+        gap_m = np.fmin(frame.slots["gap_m"][envs], NO_LEADER_GAP_M).astype(np.float32)
         self._stream.forget(tracks[~present])
-        mean, std = self._stream.advance(tracks[present], along_m(x_m, y_m)[present], gap_m[present])
-        age = self._stream.steps[tracks[present]] * np.float32(EpisodeRules.step_s / _AGE_SCALE_S)
+        mean, std = self._stream.advance(tracks[present], position_m[present], gap_m[present])
+        age = self._stream.steps[tracks[present]] * np.float32(STEP_S / _AGE_SCALE_S)
         self.traits[envs] = 0.0
         rows, slots = np.nonzero(present)
         self.traits[envs[rows], slots] = np.concatenate([mean, std, age[:, None]], axis=-1)

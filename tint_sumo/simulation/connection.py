@@ -18,7 +18,7 @@ from traci import main as traci  # with LIBSUMO_AS_TRACI the package itself is l
 
 from tint_sumo.config import Backend
 from tint_sumo.errors import InputError
-from tint_sumo.scenario.network import sumo_program
+from tint_sumo.scenes.network import sumo_program
 
 _CONNECT_TRIES, _CONNECT_WAIT_S = 600, 0.05  # sumo takes a moment to listen
 _libsumo_owner: list[int] = []  # process id of the one libsumo simulation; a forked child does not inherit the claim
@@ -26,12 +26,16 @@ _libsumo_owner: list[int] = []  # process id of the one libsumo simulation; a fo
 
 @dataclass(frozen=True)
 class Connection:
-    """A running simulation. ``vehicle`` and ``simulation`` are SUMO's TraCI domains."""
+    """A running simulation. ``vehicle``, ``vehicletype``, ``route`` and ``simulation`` are SUMO's TraCI domains."""
 
     backend: Literal["libsumo", "traci"]
     vehicle: Any
+    vehicletype: Any
+    route: Any
     simulation: Any
-    step: Callable[[], Any]
+    lane_position_m: Callable[[str], float]  # vehicle.getLanePosition, which is called more often than all else
+    step: Callable[..., Any]  # one step or, with a time, all steps until then
+    load: Callable[[list[str]], Any]  # begin anew with these options
     close: Callable[[], None]
 
 
@@ -65,7 +69,19 @@ def _libsumo(options: Sequence[str]) -> Connection:
             _libsumo_owner.clear()
             libsumo.close()
 
-    return Connection("libsumo", libsumo.vehicle, libsumo.simulation, libsumo.simulationStep, close)
+    # The Python function that SWIG puts around it would take a third of a call's time.
+    lane_position_m = getattr(libsumo._libsumo, "vehicle_getLanePosition", libsumo.vehicle.getLanePosition)
+    return Connection(
+        "libsumo",
+        libsumo.vehicle,
+        libsumo.vehicletype,
+        libsumo.route,
+        libsumo.simulation,
+        lane_position_m,
+        libsumo.simulationStep,
+        libsumo.load,
+        close,
+    )
 
 
 def _traci(options: Sequence[str]) -> Connection:
@@ -75,4 +91,14 @@ def _traci(options: Sequence[str]) -> Connection:
     with contextlib.redirect_stdout(io.StringIO()):  # traci prints every try
         connection = traci.connect(port, numRetries=_CONNECT_TRIES, proc=process, waitBetweenRetries=_CONNECT_WAIT_S)
     connection.getVersion()  # sumo answers once it has loaded its input, whose files may then go
-    return Connection("traci", connection.vehicle, connection.simulation, connection.simulationStep, connection.close)
+    return Connection(
+        "traci",
+        connection.vehicle,
+        connection.vehicletype,
+        connection.route,
+        connection.simulation,
+        connection.vehicle.getLanePosition,
+        connection.simulationStep,
+        connection.load,
+        connection.close,
+    )

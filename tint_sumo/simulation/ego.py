@@ -1,18 +1,34 @@
-"""The ego's low-level control: the PD law on speed, the safety check, and its claim on a lane."""
+"""The egos: the PD law on speed, the safety check, and their claims on the traffic's routes."""
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tint_sumo.compiling import compiled
-from tint_sumo.config import Scenario
-from tint_sumo.scenario.geometry import Bools, Floats, Poses, lane_y_m
+from tint_sumo.scenes.geometry import POSE, SPACING_M, Bools, Floats, Numbers, Poses, measure_distances_m, place
+from tint_sumo.scenes.layout import Layout
+from tint_sumo.scenes.own import OwnScene
+from tint_sumo.scenes.scene import Scene
+from tint_sumo.simulation.slots import EMPTY, Slots
+
+_STEP_MARGIN_M = 1.0  # more than a vehicle and the ego come closer in a step
+
+
+@dataclass(frozen=True)
+class Collision:
+    """The ego's first collision in an episode."""
+
+    slot: int  # of the other vehicle
+    member: int  # of the population: its driver
+    route: str  # its route
+    ego_x_m: float  # the ego's centre
+    ego_y_m: float
 
 
 class EgoRules(NamedTuple):
-    """What the controller and the claims of a scenario come down to (see :mod:`tint_sumo.config`)."""
+    """What the controller of a scene comes down to (see :mod:`tint_sumo.config`)."""
 
     gain_per_s: float
     accel_limit_mps2: float
@@ -22,15 +38,14 @@ class EgoRules(NamedTuple):
     closing_distance_m: float
     closing_speed_mps: float
     approach_speed_mps: float
-    path_margin_m: float
-    lower_border_y_m: float  # past which the front is on the lower lane
-    upper_border_y_m: float
+    watches_behind: bool
+    half_length_m: float  # of the ego
     step_s: float
+    way_spacing_m: float
 
     @classmethod
-    def of(cls, scenario: Scenario) -> "EgoRules":
-        controller, claim, street = scenario.ego, scenario.claim, scenario.street
-        lower_y_m, upper_y_m = (lane_y_m(street) - street.lane_width_m / 2).tolist()
+    def of(cls, scene: Scene | OwnScene) -> "EgoRules":
+        controller = scene.ego.controller
         return cls(
             controller.gain_per_s,
             controller.accel_limit_mps2,
@@ -39,12 +54,113 @@ class EgoRules(NamedTuple):
             controller.unsafe_distance_m,
             controller.closing_distance_m,
             controller.closing_speed_mps,
-            claim.approach_speed_mps,
-            claim.path_margin_m,
-            lower_y_m,
-            upper_y_m,
-            scenario.episode.step_s,
+            scene.claim.approach_speed_mps,
+            controller.watches_behind,
+            scene.vehicle.length_m / 2,
+            scene.step_s,
+            SPACING_M,
         )
+
+
+class Egos:
+    """The egos of R replicas. Read only for others.
+
+    =============== ======= ======================================================================
+    ``front_m``     (R,)    front bumper's distance along the ego's way
+    ``speed_mps``   (R,)
+    ``pose``        (R,)    records of :data:`~tint_sumo.scenes.geometry.POSE`
+    ``distance_m``  (R, V)  from its box to the vehicles' boxes; infinite if far, or where there is none
+    ``unsafe``      (R,)    what the safety check says for the next step
+    ``has_claimed`` (R, K)  which of the traffic's routes it claims
+    ``collision``   R items the first collision in the episode, or None
+    =============== ======= ======================================================================
+    """
+
+    def __init__(self, replicas: int, layout: Layout) -> None:
+        scene, routes = layout.scene, len(layout.routes)
+        self._layout = layout
+        self._rules = EgoRules.of(scene)
+        # The safety check needs to know how far away a vehicle was a step before.
+        self._reach_m = max(self._rules.closing_distance_m, self._rules.unsafe_distance_m) + _STEP_MARGIN_M
+        self.front_m: Floats = np.zeros(replicas)
+        self.speed_mps: Floats = np.zeros(replicas)
+        self.pose: Poses = np.zeros(replicas, POSE)
+        self.distance_m: Floats = np.full((replicas, scene.max_vehicles), np.inf)
+        self._was_distance_m: Floats = np.full((replicas, scene.max_vehicles), np.inf)  # a step ago
+        self.unsafe: Bools = np.zeros(replicas, bool)
+        self.has_claimed: Bools = np.zeros((replicas, routes), bool)
+        self.claim_changed: Bools = np.zeros((replicas, routes), bool)
+        self._hit_slot: Numbers = np.full(replicas, EMPTY)
+        self.collision: list[Collision | None] = [None] * replicas
+
+    @property
+    def collided(self) -> Bools:
+        """Whether the ego has had a collision in the episode; (R,)."""
+        return np.asarray(self._hit_slot != EMPTY)
+
+    def begin(self, replica: int) -> None:
+        """An ego stands at its start."""
+        self.forget(replica)
+        self.front_m[replica] = self._layout.scene.ego.start_m
+        self.speed_mps[replica] = 0.0
+        self._place(slice(replica, replica + 1))
+
+    def forget(self, replica: int) -> None:
+        """Nothing has happened in a replica yet."""
+        self.distance_m[replica] = np.inf
+        self._was_distance_m[replica] = np.inf
+        self.unsafe[replica] = False
+        self.has_claimed[replica] = False
+        self._hit_slot[replica] = EMPTY
+        self.collision[replica] = None
+
+    def _place(self, replicas: slice) -> None:
+        layout = self._layout
+        place(self.front_m[replicas], layout.ego.way, layout.scene.vehicle.length_m, self.pose[replicas])
+
+    def drive(self, desired_mps: Floats) -> None:
+        """Move on by a step."""
+        drive(desired_mps, self.unsafe, self._rules, self.speed_mps, self.front_m)
+        self._place(slice(None))
+
+    def update_claims(self) -> bool:
+        """Claim routes and give them up; ``claim_changed`` (R, K) tells where that changed, the answer whether any."""
+        zones = self._layout.zones
+        return update_claims(
+            self.front_m,
+            self.speed_mps,
+            zones.enter_m,
+            zones.inside_m,
+            zones.towards,
+            self._rules,
+            self.has_claimed,
+            self.claim_changed,
+        )
+
+    def look_around(self, slots: Slots) -> None:
+        """Run the safety check for the next step, and latch collisions."""
+        shape = self._layout.scene.vehicle
+        self.distance_m, self._was_distance_m = self._was_distance_m, self.distance_m
+        measure_distances_m(
+            self.pose, slots.present, slots.pose, self._reach_m, shape.length_m, shape.width_m, self.distance_m
+        )
+        if check_safety(
+            self.distance_m,
+            self._was_distance_m,
+            self.pose,
+            slots.pose,
+            self._rules,
+            self.unsafe,
+            self._hit_slot,
+        ):
+            for replica in np.flatnonzero(self.collided).tolist():
+                if self.collision[replica] is None:
+                    self.collision[replica] = self._collision(replica, int(self._hit_slot[replica]), slots)
+
+    def _collision(self, replica: int, slot: int, slots: Slots) -> Collision:
+        route = self._layout.scene.routes[slots.route[replica, slot]].name
+        pose = self.pose[replica]
+        return Collision(slot, int(slots.member[replica, slot]), route, float(pose["x_m"]), float(pose["y_m"]))
 
 
 @compiled
@@ -73,11 +189,20 @@ def is_unsafe(distance_m: float, closing_mps: float, rules: EgoRules) -> bool:
 
 
 @compiled
-def check_safety(distance_m: Floats, before_m: Floats, rules: EgoRules, unsafe: Bools, hit: NDArray[np.int64]) -> bool:
+def check_safety(
+    distance_m: Floats,
+    before_m: Floats,
+    egos: Poses,
+    vehicles: Poses,
+    rules: EgoRules,
+    unsafe: Bools,
+    hit: Numbers,
+) -> bool:
     """Look at the vehicles around each ego.
 
     Args:
         distance_m, before_m: (R, V) to vehicles, now and a step ago; infinite where there is none, or none was.
+        egos, vehicles: (R,) and (R, V) poses.
         unsafe: (R,) written: whether any vehicle is dangerously close.
         hit: (R,) the first slot whose vehicle the ego has touched, written where it was -1.
 
@@ -90,7 +215,9 @@ def check_safety(distance_m: Floats, before_m: Floats, rules: EgoRules, unsafe: 
         for slot in range(distance_m.shape[1]):
             now_m, was_m = distance_m[row, slot], before_m[row, slot]
             closing_mps = (was_m - now_m) / rules.step_s if math.isfinite(was_m) else 0.0
-            unsafe[row] = unsafe[row] or is_unsafe(now_m, closing_mps, rules)
+            if is_unsafe(now_m, closing_mps, rules):
+                counts = rules.watches_behind or not is_behind(vehicles[row, slot], egos[row], rules.half_length_m)
+                unsafe[row] = unsafe[row] or counts
             if now_m == 0.0 and hit[row] < 0:
                 hit[row] = slot
                 any_new = True
@@ -98,25 +225,39 @@ def check_safety(distance_m: Floats, before_m: Floats, rules: EgoRules, unsafe: 
 
 
 @compiled
-def claims(front_y_m: float, towards_mps: float, border_y_m: float, rules: EgoRules) -> bool:
-    """Whether an ego claims the lane behind a border.
-
-    It does once its front is past the border and it either moves in or stands in the vehicles' path. Without the second
-    condition a standing ego could probe drivers at no risk.
-    """
-    past_m = front_y_m - border_y_m
-    return past_m > 0.0 and (towards_mps > rules.approach_speed_mps or past_m > rules.path_margin_m)
+def is_behind(vehicle: Any, ego: Any, half_length_m: float) -> bool:
+    """Whether a vehicle's centre is behind an ego's back; both are poses."""
+    ahead_m = (vehicle.x_m - ego.x_m) * ego.heading_x + (vehicle.y_m - ego.y_m) * ego.heading_y
+    return bool(ahead_m < -half_length_m)
 
 
 @compiled
-def update_claims(poses: Poses, speed_mps: Floats, rules: EgoRules, claimed: Bools, changed: Bools) -> bool:
-    """Write which lanes (lower, upper) each ego claims and where that changed, both (R, 2); whether any did."""
+def update_claims(
+    front_m: Floats,
+    speed_mps: Floats,
+    enter_m: Floats,
+    inside_m: Floats,
+    towards: Floats,
+    rules: EgoRules,
+    claimed: Bools,
+    changed: Bools,
+) -> bool:
+    """Write which routes each ego claims and where that changed, both (R, K); whether any did.
+
+    An ego claims a route once its front has entered the lane and it either moves in or stands in the vehicles' path.
+    Without the second condition a standing ego could probe drivers at no risk.
+
+    Args:
+        front_m, speed_mps: (R,).
+        enter_m, inside_m, towards: (K,), (K,) and (K, P); see :class:`~tint_sumo.scenes.layout.ConflictZones`.
+    """
     any_changed = False
-    for row in range(len(poses)):
-        towards_mps = speed_mps[row] * poses[row].front_direction_y
-        for lane, border_y_m in enumerate((rules.lower_border_y_m, rules.upper_border_y_m)):
-            now = claims(poses[row].front_y_m, towards_mps, border_y_m, rules)
-            changed[row, lane] = now != claimed[row, lane]
-            claimed[row, lane] = now
-            any_changed = any_changed or changed[row, lane]
+    for row in range(len(front_m)):
+        index = min(max(int(front_m[row] / rules.way_spacing_m), 0), towards.shape[1] - 1)
+        for route in range(len(enter_m)):
+            moves_in = speed_mps[row] * towards[route, index] > rules.approach_speed_mps
+            now = front_m[row] > enter_m[route] and (moves_in or front_m[row] > inside_m[route])
+            changed[row, route] = now != claimed[row, route]
+            claimed[row, route] = now
+            any_changed = any_changed or changed[row, route]
     return any_changed

@@ -1,88 +1,88 @@
 """How many cases a careful driver can finish in time at best, whatever it knows."""
 
+from dataclasses import replace
+
 import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from tint_sumo.config import Scenario, Share, Traffic
+from tint_sumo.config import Share
 from tint_sumo.envs.episodes import episode_seed
-from tint_sumo.scenario.geometry import LOWER, UPPER, EgoPath, swept_area_start_m
-from tint_sumo.simulation.intersections import Intersections
+from tint_sumo.scenes import T_INTERSECTION, find_scene
+from tint_sumo.scenes.layout import Layout
+from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.study.evaluation import BATCH, case_seed
 
-_LANES = (LOWER, UPPER)
 
-
-def ceiling(p_conservative: Share, episodes: int, seed: int = 0) -> float:
+def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str = T_INTERSECTION) -> float:
     """Share of the cases in which enough yielding drivers come in time.
 
-    A careful ego enters a lane only before a driver that yields. It knows all traits, never brakes on its way and needs
-    no room to the vehicle that passes before the yielding driver, so that no careful policy does better. One that takes
-    risks can: it may slip through before an aggressive driver.
+    A careful ego enters a route only before a driver that yields. It knows all traits, never brakes on its way and
+    needs no room to the vehicle that passes before the yielding driver, so that no careful policy does better. One that
+    takes risks can: it may slip through before an aggressive driver.
 
     Args:
         p_conservative, episodes, seed: of the cases, see :func:`tint_sumo.study.evaluation.evaluate`.
+        scene: name of the scene.
     """
-    scenario = Scenario(Traffic(p_conservative))
+    played = find_scene(scene)
+    played = replace(played, traffic=replace(played.traffic, p_conservative=p_conservative))
     finished = 0
-    simulation = Intersections(min(BATCH, episodes), scenario, with_ego=False)
+    simulation = Simulation(min(BATCH, episodes), played, with_ego=False)
     try:
         for first in range(0, episodes, simulation.replicas):
             count = min(simulation.replicas, episodes - first)
             for replica in range(count):
                 rng, _ = seeding.np_random(case_seed(seed, first + replica))
                 simulation.reset(replica, episode_seed(rng))
-            finished += int(_finishes(simulation, scenario)[:count].sum())
+            finished += int(_finishes(simulation)[:count].sum())
     finally:
         simulation.close()
     return finished / episodes
 
 
-def _finishes(simulation: Intersections, scenario: Scenario) -> NDArray[np.bool_]:
+def _finishes(simulation: Simulation) -> NDArray[np.bool_]:
     """Which replicas let a careful ego through before the time limit; (R,)."""
-    rules, top_mps = scenario.episode, max(scenario.ego.desired_speeds_mps)
-    way_s = _way_m(scenario) / top_mps
-    openings = _openings(simulation, scenario)
+    scene, layout = simulation.scene, simulation.layout
+    way_s = way_m(layout) / max(scene.ego.controller.desired_speeds_mps)
+    openings = _openings(simulation)
     done = np.zeros(simulation.replicas, bool)
     for replica in range(simulation.replicas):
         time_s = 0.0
-        for lane, approach_s in zip(_LANES, way_s, strict=False):
+        for route, approach_s in zip(np.argsort(layout.zones.enter_m).tolist(), way_s, strict=False):
             time_s += approach_s
-            usable = [max(time_s, opens_s) for opens_s, closes_s in openings[replica][lane] if closes_s >= time_s]
+            usable = [max(time_s, opens_s) for opens_s, closes_s in openings[replica][route] if closes_s >= time_s]
             time_s = min(usable, default=np.inf)
-        done[replica] = time_s + way_s[-1] <= rules.time_limit_s
+        done[replica] = time_s + way_s[-1] <= scene.time_limit_s
     return done
 
 
-def _way_m(scenario: Scenario) -> NDArray[np.float64]:
-    """Lengths of the ego's way to the lower lane, from there to the upper lane, and from there to the goal."""
-    street, vehicle, rules = scenario.street, scenario.vehicle, scenario.episode
-    path = EgoPath.of(street, vehicle)
-    goal_m = path.turn_end_m + rules.goal_x_m + vehicle.length_m / 2 - path.end_x_m
-    half_m = street.lane_width_m / 2
-    borders_m = (path.crossing_m(street.lower_y_m - half_m), path.crossing_m(street.upper_y_m - half_m))
-    return np.diff([path.start_m(rules.ego_start_y_m), *borders_m, goal_m])
+def way_m(layout: Layout) -> NDArray[np.float64]:
+    """Lengths of the ego's way to the first route's lane, from there to the next one's, and so on to the goal."""
+    task = layout.scene.ego
+    return np.diff([task.start_m, *np.sort(layout.zones.enter_m), task.goal_m])
 
 
-def _openings(simulation: Intersections, scenario: Scenario) -> list[list[list[tuple[float, float]]]]:
-    """Of each replica and lane: from when to when the next driver to reach the ego's way is one that yields.
+def _openings(simulation: Simulation) -> list[list[list[tuple[float, float]]]]:
+    """Of each replica and route: from when to when the next driver to reach the ego's way is one that yields.
 
     The replicas are driven to their time limit.
     """
-    rules, length_m = scenario.episode, scenario.vehicle.length_m
-    stop_line_m = swept_area_start_m(scenario.street, scenario.vehicle, scenario.ego.unsafe_distance_m)
-    openings: list[list[list[tuple[float, float]]]] = [[[] for _ in _LANES] for _ in range(simulation.replicas)]
-    free_since_s = np.zeros((simulation.replicas, len(_LANES)))  # when the last vehicle had passed
-    for step in range(round(rules.time_limit_s / rules.step_s)):
-        number, past_m = simulation.vehicle_number.copy(), simulation.front_m - stop_line_m[simulation.lane]
-        time_s = (step + 1) * rules.step_s
+    scene, slots, stop_line_m = simulation.scene, simulation.slots, simulation.layout.zones.stop_line_m
+    routes, length_m = range(len(stop_line_m)), scene.vehicle.length_m
+    openings: list[list[list[tuple[float, float]]]] = [[[] for _ in routes] for _ in range(simulation.replicas)]
+    free_since_s = np.zeros((simulation.replicas, len(routes)))  # when the last vehicle had passed
+    for step in range(round(scene.time_limit_s / scene.step_s)):
+        number, past_m = slots.vehicle_number.copy(), slots.front_m - stop_line_m[slots.route]
+        time_s = (step + 1) * scene.step_s
         simulation.step()
-        same = simulation.present & (number == simulation.vehicle_number)
-        now_past_m = simulation.front_m - stop_line_m[simulation.lane]
+        same = slots.present & (number == slots.vehicle_number)
+        now_past_m = slots.front_m - stop_line_m[slots.route]
         for replica, slot in np.argwhere(same & (past_m < length_m) & (now_past_m >= length_m)).tolist():
-            free_since_s[replica, simulation.lane[replica, slot]] = time_s
+            free_since_s[replica, slots.route[replica, slot]] = time_s
+        yields = simulation.yielding.yields
         for replica, slot in np.argwhere(same & (past_m < 0.0) & (now_past_m >= 0.0)).tolist():
-            if simulation.yields[replica, slot]:
-                lane = simulation.lane[replica, slot]
-                openings[replica][lane].append((float(free_since_s[replica, lane]), time_s))
+            if yields[replica, slot]:
+                route = slots.route[replica, slot]
+                openings[replica][route].append((float(free_since_s[replica, route]), time_s))
     return openings

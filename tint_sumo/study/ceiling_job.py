@@ -5,10 +5,10 @@ from pathlib import Path
 
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, write_json
+from tint_sumo.progress import Report
 from tint_sumo.study.budgets import Trials
 from tint_sumo.study.ceiling import ceiling
 from tint_sumo.study.policy_jobs import CASES
-from tint_sumo.study.progress import Report
 
 CEILINGS_FILE = "ceilings.json"
 

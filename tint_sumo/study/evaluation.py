@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
+from tint_sumo.progress import Report, silent
 from tint_sumo.study.methods import Policy
-from tint_sumo.study.progress import Report, silent
 from tint_sumo.study.statistics import Rate
 
 # Seed of the first case. Training draws its environments' seeds below this number, so no case is ever trained on.
 CASE_SEED = 1_000_000_000
 CASES_PER_SEED = 1_000_000
 MAX_SEED = 1000
-OUTCOMES = ("success", "timeout", "collision")
 BATCH = 100  # environments at a time
 _STOP = 0  # action of environments whose case is over
 
@@ -29,7 +29,7 @@ class Case:
     outcome: str  # success, timeout or collision
     time_s: float  # when it ended
     trait: str | None = None  # of the driver that was hit
-    lane: str | None = None  # of that driver
+    route: str | None = None  # of that driver
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Evaluation:
 
     @property
     def collisions(self) -> dict[str, int]:
-        """Number of collisions by trait and lane of the driver that was hit, as ``"aggressive, lower lane"``."""
-        hits = Counter(f"{case.trait}, {case.lane} lane" for case in self.cases if case.outcome == "collision")
+        """Number of collisions by trait and route of the driver that was hit, as ``"aggressive, lower"``."""
+        hits = Counter(f"{case.trait}, {case.route}" for case in self.cases if case.outcome == "collision")
         return dict(sorted(hits.items()))
 
     def summary(self) -> dict[str, Any]:
@@ -136,4 +136,4 @@ def _first_episodes(policy: Policy, venv: VecEnv, first_seed: int, wanted: int) 
 
 def _case(info: dict[str, Any]) -> Case:
     hit = info.get("collision", {})
-    return Case(info["outcome"], round(info["time_s"], 3), hit.get("trait"), hit.get("lane"))
+    return Case(info["outcome"], round(info["time_s"], 3), hit.get("trait"), hit.get("route"))

@@ -12,9 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tint_sumo.config import ends
+from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.files import whole_file
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.evaluation import OUTCOMES
 from tint_sumo.study.methods import METHODS
 from tint_sumo.study.rows import Row
 

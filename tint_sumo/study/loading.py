@@ -10,11 +10,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits
 from tint_sumo.config import LATENT_SIZE, Share, ends, is_share
-from tint_sumo.envs.sb3 import TIntersectionVecEnv
 from tint_sumo.errors import InputError, refuse_old_name
 from tint_sumo.files import shipped
-from tint_sumo.policy import ActionRepeat, RecurrentPPO, TraitObservation, TraitSource
+from tint_sumo.policy import RecurrentPPO, TraitSource
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
+from tint_sumo.policy.venv import policy_venv
+from tint_sumo.scenes import SCENES, T_INTERSECTION, find_scene
 from tint_sumo.study.methods import METHODS, Learned, Policy, Rule, find_learned
 from tint_sumo.study.training import POLICY, TRAITS, digest
 from tint_sumo.traits import TraitModel
@@ -31,15 +32,15 @@ class Contender:
     source: Callable[[], TraitSource] | None = None  # where the traits in its observations come from; None: no traits
     p_conservative: Share = DEFAULT_P_CONSERVATIVE  # what it was trained for
     action_repeat: int = 1  # simulation steps per decision
+    scene: str = T_INTERSECTION  # what it was trained in
 
     def make_venv(self, num_envs: int, **task: Any) -> VecEnv:
-        """Environments with the observations the policy takes; ``task`` as in ``TIntersectionEnv``."""
-        venv: VecEnv = TIntersectionVecEnv(num_envs, **task)
-        observed = venv if self.source is None else TraitObservation(venv, self.source())
-        return ActionRepeat(observed, self.action_repeat)
+        """Environments with the observations the policy takes; ``task`` as in ``SceneEnv``."""
+        source = None if self.source is None else self.source()
+        return policy_venv(num_envs, source, action_repeat=self.action_repeat, **{"scene": self.scene, **task})
 
 
-def load_policy(name_or_path: str | Path, *, allow_pickle: bool = False) -> Contender:
+def load_policy(name_or_path: str | Path, *, scene: str | None = None, allow_pickle: bool = False) -> Contender:
     """A hand-written rule or a shipped policy by its name, or a trained one by its folder or file.
 
     The card, a .json file beside the weights, tells the method, and where the trait model is.
@@ -47,6 +48,7 @@ def load_policy(name_or_path: str | Path, *, allow_pickle: bool = False) -> Cont
     Args:
         name_or_path: name, folder of a training run, .safetensors file, or Stable-Baselines3's .zip file with the
             card beside it.
+        scene: name of the scene it shall drive in; if not given the one it was trained in, for rules the paper's.
         allow_pickle: read .zip files. They can run any code, so allow that only for files you trust.
 
     Raises:
@@ -54,11 +56,14 @@ def load_policy(name_or_path: str | Path, *, allow_pickle: bool = False) -> Cont
     """
     method = METHODS.get(str(name_or_path))
     if isinstance(method, Rule):
-        return Contender(method.name, method.make())
+        place = find_scene(scene or T_INTERSECTION).name
+        return Contender(method.name, method.make(place), scene=place)
     if Path(name_or_path).suffix == ".zip":
-        return _load_zip(Path(name_or_path), allow_pickle)
-    stem = find_policy(name_or_path)
-    return replace(_contender(stem, load_policy_network(stem)), name=str(name_or_path))
+        found = _load_zip(Path(name_or_path), allow_pickle)
+    else:
+        stem = find_policy(name_or_path)
+        found = replace(_contender(stem, load_policy_network(stem)), name=str(name_or_path))
+    return found if scene is None else replace(found, scene=find_scene(scene).name)
 
 
 def _load_zip(file: Path, allow_pickle: bool) -> Contender:
@@ -81,6 +86,7 @@ def _contender(stem: Path, policy: Any) -> Contender:
         lambda: learned.make_source(encoder),
         ends(card["p_conservative"]),
         int(card["settings"]["action_repeat"]),
+        card["scene"],
     )
 
 
@@ -127,6 +133,7 @@ def _checked_card(stem: Path) -> dict[str, Any]:
     settings = card.get("settings")
     fits = isinstance(method, Learned) and is_share(card.get("p_conservative"))
     fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
+    fits &= str(card.get("scene")) in SCENES
     if not fits or (isinstance(method, Learned) and method.encoder and not _is_file_name(card.get("traits"))):
         raise InputError(f"{card_file(stem)} is not the card of a policy; restore the file or train the policy again")
     return card

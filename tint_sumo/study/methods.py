@@ -39,7 +39,7 @@ class Rule:
 
     name: str
     title: str  # in tables and figures
-    make: Callable[[], Policy]
+    make: Callable[[str], Policy]  # takes the name of a scene
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Learned:
     name: str
     title: str
     source: Callable[..., TraitSource]  # takes the trait model if there is one
-    encoder: str | None = None  # trait method (``tint_sumo.traits.METHODS``) whose model it needs
+    encoder: str | None = None  # trait method (``tint_sumo.traits.TRAIT_METHODS``) whose model it needs
     attention: bool = True
     critic_sees_true_traits: bool = False  # in training; the policy itself never does
     trained_as: str | None = None  # the method whose training it shares, if it drives with other traits than it learnt
@@ -101,8 +101,8 @@ def find_learned(name: str) -> Learned:
     return method
 
 
-register(Rule("always_go", "always go", AlwaysGo))
-register(Rule("ttc", "time to collision", TimeToCollision))
+register(Rule("always_go", "always go", lambda _: AlwaysGo()))
+register(Rule("ttc", "time to collision", lambda scene: TimeToCollision(scene=scene)))
 register(Learned("no_labels", "no labels", NoTraits))
 register(Learned("morton", "Morton", EncoderTraits, encoder="morton"))
 register(Learned("vae", "paper's method", EncoderTraits, encoder="vae"))

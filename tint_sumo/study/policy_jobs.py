@@ -9,14 +9,15 @@ import pandas as pd
 import torch
 
 from tint_sumo.config import PpoSettings, Share, ends
+from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_json
+from tint_sumo.progress import Report
 from tint_sumo.study.budgets import Conditions, Trials
-from tint_sumo.study.evaluation import OUTCOMES, Evaluation, evaluate
+from tint_sumo.study.evaluation import Evaluation, evaluate
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import METHODS, Rule, find_learned, find_method
 from tint_sumo.study.pool import THREADS_PER_JOB
-from tint_sumo.study.progress import Report
 from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Measured, Result
 from tint_sumo.study.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
 

@@ -13,8 +13,7 @@ from tqdm import tqdm
 
 from tint_sumo.errors import InputError
 from tint_sumo.processes import start_worker
-from tint_sumo.progress import make_bar
-from tint_sumo.study.progress import Report
+from tint_sumo.progress import Report, make_bar
 
 REFRESH_S = 1.0
 THREADS_PER_JOB = 1  # of torch: the jobs share the cores among them

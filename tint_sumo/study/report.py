@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tint_sumo.config import ends
+from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.files import write_text
 from tint_sumo.study.ceiling_job import read_ceilings
-from tint_sumo.study.evaluation import OUTCOMES
 from tint_sumo.study.figures import plot_bars, plot_curves, plot_worlds
 from tint_sumo.study.methods import METHODS
 from tint_sumo.study.policy_jobs import read_curves

@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from tint_sumo.config import Share
+from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.evaluation import OUTCOMES, Case, Evaluation
+from tint_sumo.study.evaluation import Case, Evaluation
 
 RESULTS = "results"  # folder of the results in a study's folder
 TRAINED, GIVEN = "trained", "given"  # where a policy comes from: the study itself, or a rule or the package

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from tint_sumo.config import Idm, Share, ends
+from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.evaluation import OUTCOMES, Evaluation
+from tint_sumo.study.evaluation import Evaluation
 from tint_sumo.study.methods import METHODS, Learned
 from tint_sumo.study.published import RATES_PERCENT
 from tint_sumo.study.results import GIVEN, Result

@@ -17,20 +17,20 @@ import safetensors.torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import VecEnv
 
-from tint_sumo import ENV_ID
 from tint_sumo import traits as trait_models
 from tint_sumo.config import LATENT_SIZE, PpoSettings, Share, ends, require_share
-from tint_sumo.envs.sb3 import TIntersectionVecEnv
+from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file, write_text
-from tint_sumo.policy import ActionRepeat, GruPolicy, OracleTraits, RecurrentPPO, TraitObservation
+from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy
-from tint_sumo.policy.trait_observation import TRUE_TRAITS
-from tint_sumo.study.evaluation import CASE_SEED, OUTCOMES, require_seed
+from tint_sumo.policy.venv import policy_venv
+from tint_sumo.progress import Report, silent
+from tint_sumo.scenes import T_INTERSECTION, find_scene
+from tint_sumo.study.evaluation import CASE_SEED, require_seed
 from tint_sumo.study.methods import Learned, find_learned
-from tint_sumo.study.progress import Report, silent
 from tint_sumo.traits import TraitModel
 from tint_sumo.traits.storage import read_card, save
 
@@ -57,6 +57,7 @@ def train_policy(
     out: Path,
     *,
     settings: PpoSettings,
+    scene: str = T_INTERSECTION,
     traits: str | Path | None = None,
     with_zip: bool = False,
     report: Report = silent,
@@ -74,6 +75,7 @@ def train_policy(
         seed: of weights, actions and environments, 0 to 1000.
         out: a new folder, or the one of this very run.
         settings: network and PPO; its ``total_steps`` is not used.
+        scene: name of the scene it trains in.
         traits: trait model by name or path, for methods that infer traits; the shipped one if not given.
         with_zip: write the policy as Stable-Baselines3's policy.zip, too.
         report: told of the progress.
@@ -97,6 +99,8 @@ def train_policy(
         "p_conservative": list(ends(p_conservative)),
         "steps": steps,
         "seed": seed,
+        "scene": scene,
+        "scene_digest": find_scene(scene).digest,
         "settings": asdict(settings),
         "traits": None if encoder is None else digest(encoder),
     }
@@ -108,7 +112,7 @@ def train_policy(
             if encoder is not None:
                 save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
             card = _card(identity, encoder)
-            venv = training_venv(learned, encoder, p_conservative, settings)
+            venv = training_venv(learned, encoder, p_conservative, settings, scene)
             try:
                 model = _learn(venv, steps, seed, out, settings, card, report)
             finally:
@@ -133,7 +137,7 @@ def share_training(source: Path, method: str, out: Path, traits: str | Path | No
     encoder = _load_encoder(learned, traits)
     assert encoder is not None
     shared = read_policy_card(snapshot_stem(source, 100))
-    training = {key: shared[key] for key in ("method", "p_conservative", "steps", "seed")}
+    training = {key: shared[key] for key in ("method", "p_conservative", "steps", "seed", "scene")}
     with claim_folder(out, {"kind": "policy", "method": method, "traits": digest(encoder), "training": training}):
         save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
         for percent in (*SNAPSHOTS_PERCENT, 100):
@@ -150,14 +154,25 @@ def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | N
     return encoder
 
 
-def training_venv(learned: Learned, encoder: TraitModel | None, p_conservative: Share, settings: PpoSettings) -> VecEnv:
+def training_venv(
+    learned: Learned,
+    encoder: TraitModel | None,
+    p_conservative: Share,
+    settings: PpoSettings,
+    scene: str = T_INTERSECTION,
+) -> VecEnv:
     """Environments with the traits that the method is trained with."""
     shown = learned if learned.trained_as is None else find_learned(learned.trained_as)
-    venv = TIntersectionVecEnv(settings.n_envs, p_conservative=p_conservative, time_limit_s=settings.time_limit_s)
-    observed = TraitObservation(venv, shown.make_source(encoder if shown.encoder else None))
-    if learned.critic_sees_true_traits:
-        observed = TraitObservation(observed, OracleTraits(), TRUE_TRAITS)
-    return ActionRepeat(VecMonitor(observed), settings.action_repeat)
+    return policy_venv(
+        settings.n_envs,
+        shown.make_source(encoder if shown.encoder else None),
+        action_repeat=settings.action_repeat,
+        critic_sees_true_traits=learned.critic_sees_true_traits,
+        monitored=True,
+        scene=scene,
+        p_conservative=p_conservative,
+        time_limit_s=settings.time_limit_s,
+    )
 
 
 def _learn(
@@ -307,7 +322,6 @@ def _card(identity: Mapping[str, Any], encoder: TraitModel | None) -> dict[str, 
     packages = ("tint_sumo", "libsumo", "torch", "stable-baselines3", "gymnasium", "numpy")
     return {
         **{key: value for key, value in identity.items() if key != "kind"},
-        "environment": ENV_ID,
         **_traits_entries(encoder),
         "versions": {name: version(name) for name in packages} | {"python": platform.python_version()},
     }

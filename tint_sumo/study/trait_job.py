@@ -7,8 +7,8 @@ import torch
 
 from tint_sumo.config import TraitSettings
 from tint_sumo.files import write_json
+from tint_sumo.progress import Report
 from tint_sumo.study.pool import THREADS_PER_JOB
-from tint_sumo.study.progress import Report
 from tint_sumo.study.trait_models import evaluate_traits, plot_traits, train_traits
 from tint_sumo.traits.storage import add_to_card
 

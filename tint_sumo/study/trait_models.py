@@ -13,7 +13,7 @@ from tint_sumo.dataset.windows import Windows, load_labels, load_windows, read_m
 from tint_sumo.errors import InputError
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
 from tint_sumo.traits.figures import plot_latents, plot_reconstructions
-from tint_sumo.traits.model import find_method
+from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.storage import read_card
 from tint_sumo.traits.training import train
 from tint_sumo.traits.vae import Vae
@@ -27,7 +27,7 @@ def train_traits(
     Args:
         data: folder of a dataset.
         out: a new folder, or the one of this very run; model.safetensors and model.json go there.
-        method: a name in ``tint_sumo.traits.METHODS``.
+        method: a name in ``tint_sumo.traits.TRAIT_METHODS``.
         settings: sizes, loss weights and schedule.
         seed: of weights, order and noise, and of the split into training and test episodes.
         progress: show a progress bar on stderr.
@@ -61,19 +61,22 @@ def train_on_split(
         method=method,
         seed=seed,
         latent_size=latent_size,
-        conservative=load_labels(data, windows)[chosen] if find_method(method).uses_labels else None,
+        conservative=load_labels(data, windows)[chosen] if find_trait_method(method).uses_labels else None,
         progress=progress,
         card={"data": describe(data)},
     )
 
 
-def evaluate_traits(data: Path, model: str | Path, *, noise_m: float = 0.0) -> dict[str, Any]:
+def evaluate_traits(
+    data: Path, model: str | Path, *, noise_m: float = 0.0, other_scene: bool = False
+) -> dict[str, Any]:
     """Accuracy of classifiers on a model's latents, in the episodes that its training left out.
 
     Args:
         data: folder of a dataset.
         model: name of a shipped model, folder of a training run, or path of a .safetensors file.
         noise_m: standard deviation of the noise on every position.
+        other_scene: take a model of another scene than the dataset's, too.
 
     Returns:
         ``model``, ``noise_m`` and the fields of ``TraitAccuracy``.
@@ -81,18 +84,20 @@ def evaluate_traits(data: Path, model: str | Path, *, noise_m: float = 0.0) -> d
     Raises:
         InputError: no usable dataset or model.
     """
-    trained, windows, labels, seed = _load_for_test(data, model, noise_m)
+    trained, windows, labels, seed = _load_for_test(data, model, noise_m, other_scene)
     found = evaluate(trained, windows, labels, noise_m=noise_m, seed=seed)
     return {"model": str(model), "noise_m": noise_m, **asdict(found)}
 
 
-def plot_traits(data: Path, model: str | Path, out: Path, *, noise_m: float = 0.0) -> list[Path]:
+def plot_traits(
+    data: Path, model: str | Path, out: Path, *, noise_m: float = 0.0, other_scene: bool = False
+) -> list[Path]:
     """Write pictures of what a model makes of unseen episodes into the folder ``out``; the files written.
 
     Raises:
         InputError: no usable dataset or model.
     """
-    trained, windows, labels, seed = _load_for_test(data, model, noise_m)
+    trained, windows, labels, seed = _load_for_test(data, model, noise_m, other_scene)
     _, unseen = split_by_episode(windows, TEST_FRACTION, seed)
     files = [out / "latent.png"]
     plot_latents(trained, windows[unseen], labels[unseen], files[0], noise_m=noise_m)
@@ -103,11 +108,13 @@ def plot_traits(data: Path, model: str | Path, out: Path, *, noise_m: float = 0.
 
 
 def _load_for_test(
-    data: Path, model: str | Path, noise_m: float
+    data: Path, model: str | Path, noise_m: float, other_scene: bool
 ) -> tuple[traits.TraitModel, Windows, NDArray[np.bool_], int]:
     """A model, a dataset it may be tested on, its labels, and the seed of the split into training and test."""
     require_noise(noise_m)
     trained = traits.load(model)
+    if not other_scene:
+        _require_same_scene(data, model)
     _require_unseen(data, model)
     windows = load_windows(data)
     return trained, windows, load_labels(data, windows), int(read_card(model).get("seed", 0))
@@ -122,7 +129,17 @@ def require_noise(noise_m: float) -> None:
 def describe(data: Path) -> dict[str, Any]:
     """What a model's card says about the dataset it was trained on."""
     manifest = read_manifest(data)
-    return {key: manifest[key] for key in ("p_conservative", "population", "seed", "windows")}
+    return {key: manifest[key] for key in ("scene", "scene_digest", "p_conservative", "population", "seed", "windows")}
+
+
+def _require_same_scene(data: Path, model: str | Path) -> None:
+    """Raise InputError if the model was trained in another scene, or in an earlier version of this one."""
+    trained_on, here = read_card(model).get("data") or {}, describe(data)
+    if trained_on.get("scene_digest", here["scene_digest"]) != here["scene_digest"]:
+        raise InputError(
+            f"{model} was trained in scene {trained_on.get('scene')}, {data} is of scene {here['scene']}; "
+            "say --other-scene to use it all the same"
+        )
 
 
 def _require_unseen(data: Path, model: str | Path) -> None:
@@ -132,7 +149,7 @@ def _require_unseen(data: Path, model: str | Path) -> None:
     """
     trained_on = read_card(model).get("data") or {}
     here = describe(data)
-    alike = all(trained_on.get(key) == here[key] for key in ("p_conservative", "population", "seed"))
+    alike = all(trained_on.get(key) == here[key] for key in ("scene", "p_conservative", "population", "seed"))
     if alike and trained_on["windows"] != here["windows"]:
         raise InputError(
             f"{data} has episodes that {model} was trained on; record another dataset with --seed {here['seed'] + 1}"

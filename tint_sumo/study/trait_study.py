@@ -12,14 +12,14 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, write_json
+from tint_sumo.progress import Report
 from tint_sumo.study.budgets import TRAIT_BUDGETS
 from tint_sumo.study.pool import THREADS_PER_JOB, Job, run_jobs
-from tint_sumo.study.progress import Report
 from tint_sumo.study.results import RESULTS
 from tint_sumo.study.trait_models import train_on_split
 from tint_sumo.study.trait_report import TraitReport, write_trait_report
 from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, linear_r2
-from tint_sumo.traits.model import find_method
+from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.storage import RUN_MODEL, add_to_card
 
 DATASET_SEED = 2022
@@ -60,7 +60,7 @@ def run_trait_study(study: TraitStudy, out: Path, *, workers: int = 2, progress:
     if workers < 1:
         raise InputError(f"workers must be at least 1, not {workers}")
     for method in study.methods:
-        find_method(method)
+        find_trait_method(method)
     with claim_folder(out, {"kind": "trait study", **asdict(study)}):
         for folder, windows, p_conservative in _recordings(study, out):
             record(

@@ -5,26 +5,26 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tint_sumo.dataset.schema import NO_LEADER_GAP_M
+from tint_sumo.config import NO_LEADER_GAP_M
 from tint_sumo.dataset.windows import Windows
 
 
 @dataclass(frozen=True)
-class Batch:
+class WindowBatch:
     """N windows as in ``tint_sumo.dataset.windows.Windows``; what stands after a window's length is of no account."""
 
     states: Tensor  # (N, T, 2) m: offset and gap
     length: Tensor  # (N,)
-    other: "Batch | None" = None  # of each window's driver another window, or the same one if it has only one
+    other: "WindowBatch | None" = None  # of each window's driver another window, or the same one if it has only one
     conservative: Tensor | None = None  # (N,) bool, for methods that are trained with labels
 
-    def with_noise(self, noise_m: float, generator: torch.Generator) -> "Batch":
+    def with_noise(self, noise_m: float, generator: torch.Generator) -> "WindowBatch":
         """The same windows as positions measured with noise would give them."""
         if noise_m == 0.0:
             return self
         states = add_position_noise(self.states, noise_m, generator)
         other = None if self.other is None else self.other.with_noise(noise_m, generator)
-        return Batch(states, self.length, other, self.conservative)
+        return WindowBatch(states, self.length, other, self.conservative)
 
 
 class TrainingWindows:
@@ -36,14 +36,14 @@ class TrainingWindows:
         self._conservative = conservative
         self._siblings = Siblings(torch.from_numpy(windows.driver)) if with_other else None
 
-    def batch(self, index: Tensor, generator: torch.Generator) -> Batch:
+    def batch(self, index: Tensor, generator: torch.Generator) -> WindowBatch:
         """The windows (N,) at ``index``, beside others that ``generator`` chooses."""
         labels = None if self._conservative is None else self._conservative[index]
         other = None
         if self._siblings is not None:
             chosen = self._siblings.draw(index, generator)
-            other = Batch(self.states[chosen], self.length[chosen])
-        return Batch(self.states[index], self.length[index], other, labels)
+            other = WindowBatch(self.states[chosen], self.length[chosen])
+        return WindowBatch(self.states[index], self.length[index], other, labels)
 
 
 class Siblings:

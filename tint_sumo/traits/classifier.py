@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tint_sumo.config import LATENT_SIZE, TraitSettings
-from tint_sumo.traits.batches import Batch
+from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.model import TraitModel, register
 
 
@@ -28,7 +28,7 @@ class Classifier(TraitModel):
         mean, log_var = super().encode(states, length)
         return mean, torch.full_like(log_var, -torch.inf)
 
-    def loss(self, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:  # noqa: ARG002
+    def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:  # noqa: ARG002
         """Only ``total``, the cross-entropy of the classes in nats."""
         assert batch.conservative is not None
         mean, _ = self.encode(batch.states, batch.length)
@@ -39,6 +39,6 @@ class Classifier(TraitModel):
         logit: Tensor = self.output(latents).squeeze(-1).float()
         return logit
 
-    def squared_errors_m2(self, batch: Batch) -> Tensor:
+    def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
         """None: a classifier predicts no positions."""
         return batch.states.new_empty(0)

@@ -6,9 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tint_sumo.config import LATENT_SIZE, WINDOW_STEPS, TraitSettings
-from tint_sumo.dataset.recorder import MIN_WINDOW_STEPS
-from tint_sumo.traits.batches import Batch
+from tint_sumo.config import LATENT_SIZE, MIN_WINDOW_STEPS, WINDOW_STEPS, TraitSettings
+from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import kl_divergence, sample
 from tint_sumo.traits.model import FEATURES, TraitModel, register, valid_steps
 
@@ -54,7 +53,7 @@ class CrossWindow(TraitModel):
         shape = (len(states), pieces, self.latent_size)
         return fuse(mean.view(shape), log_var.view(shape), lengths >= MIN_WINDOW_STEPS)
 
-    def loss(self, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
+    def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:
         """Terms ``kl`` and ``prediction``, the negative log-likelihood of the other window, in nats per window."""
         mean, log_var = self.encode(batch.states, batch.length)
         latents = sample(mean, log_var, generator, SAMPLES)
@@ -65,13 +64,13 @@ class CrossWindow(TraitModel):
         terms = {"kl": kl_divergence(mean, log_var).mean(), "prediction": prediction.mean()}
         return {**terms, "total": terms["prediction"] + KL_WEIGHT * terms["kl"]}
 
-    def squared_errors_m2(self, batch: Batch) -> Tensor:
+    def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
         """Of the next positions in the other windows, each predicted from the true ones before it."""
         mean, _ = self.encode(batch.states, batch.length)
         displacement, _, target, valid = self._predict(batch, mean.unsqueeze(0))
         return ((displacement[0] - target)[valid] * self.feature_scale[0]).square()
 
-    def _predict(self, batch: Batch, latents: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _predict(self, batch: WindowBatch, latents: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The other windows' scaled displacements from their second step on, T - 1 of them.
 
         Args:

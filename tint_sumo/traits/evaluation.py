@@ -1,6 +1,6 @@
 """How well traits can be read from a model's latents: with labels, which label-free methods meet nowhere else."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -151,10 +151,23 @@ def linear_r2(
         (P,) coefficients of determination R2; 1 is perfect, 0 no better than the mean.
     """
     train, test = split_by_episode(windows, TEST_FRACTION, seed)
-    mean = encode_windows(model, windows, noise_m=noise_m, seed=seed).mean
-    fitted = LinearRegression().fit(mean[train], properties[train])
-    residual = properties[test] - fitted.predict(mean[test])
-    return np.asarray(1.0 - residual.var(axis=0) / properties[test].var(axis=0))
+    return fit_line(model, windows[train], properties[train], noise_m=noise_m, seed=seed)(
+        windows[test], properties[test]
+    )
+
+
+def fit_line(
+    model: TraitModel, windows: Windows, properties: NDArray[np.floating], *, noise_m: float = 0.0, seed: int = 0
+) -> Callable[[Windows, NDArray[np.floating]], NDArray[np.float64]]:
+    """A linear map from the latent mean to properties of the driver; call it for its R2 on other windows."""
+    fitted = LinearRegression().fit(encode_windows(model, windows, noise_m=noise_m, seed=seed).mean, properties)
+
+    def r2(windows: Windows, properties: NDArray[np.floating]) -> NDArray[np.float64]:
+        means = encode_windows(model, windows, noise_m=noise_m, seed=seed + 1).mean
+        residual = properties - fitted.predict(means)
+        return np.asarray(1.0 - np.square(residual).mean(axis=0) / properties.var(axis=0))
+
+    return r2
 
 
 def encode_windows(model: TraitModel, windows: Windows, *, noise_m: float = 0.0, seed: int = 0) -> Latents:

@@ -9,8 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, WINDOW_STEPS, EpisodeRules, VehicleShape
-from tint_sumo.dataset.schema import NO_LEADER_GAP_M
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, NO_LEADER_GAP_M, STEP_S, WINDOW_STEPS, VehicleShape
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.files import whole_file
 from tint_sumo.traits.evaluation import encode_windows
@@ -78,7 +77,7 @@ def plot_reconstructions(model: Vae, windows: Windows, file: Path, *, seed: int 
     states, length = torch.from_numpy(chosen.states), torch.from_numpy(chosen.length)
     with torch.no_grad():
         decoded = model.reconstruct(states, length).numpy()
-    time_s = EpisodeRules.step_s * np.arange(WINDOW_STEPS)
+    time_s = STEP_S * np.arange(WINDOW_STEPS)
 
     figure = Figure(figsize=(11.0, 4.2), dpi=150, layout="constrained")
     grid = figure.subplots(2, len(chosen), sharex=True, sharey="row", squeeze=False)

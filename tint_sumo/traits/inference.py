@@ -7,10 +7,8 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from tint_sumo.config import VehicleShape
-from tint_sumo.dataset.recorder import MIN_WINDOW_STEPS
-from tint_sumo.dataset.schema import NO_LEADER_GAP_M
-from tint_sumo.dataset.tracks import STEP_S, read_tracks
+from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, STEP_S, VehicleShape
+from tint_sumo.dataset.tracks import read_tracks
 from tint_sumo.dataset.windows import cut_windows, steps_in_window
 from tint_sumo.errors import InputError
 from tint_sumo.files import whole_file

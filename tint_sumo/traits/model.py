@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.errors import InputError, refuse_old_name
-from tint_sumo.traits.batches import Batch
+from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import WindowEncoder
 
 FEATURES = 2  # numbers per step: displacement and gap
@@ -50,11 +50,11 @@ class TraitModel(nn.Module, ABC):
         self.encoder = WindowEncoder(len(self.feature_spread), settings, latent_size)
 
     @abstractmethod
-    def loss(self, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
+    def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:
         """Named scalar terms of the training loss and ``"total"``, the one to minimise."""
 
     @abstractmethod
-    def squared_errors_m2(self, batch: Batch) -> Tensor:
+    def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
         """Squared errors (M,) in m2 of all positions that the latent means predict; M is 0 if they predict none."""
 
     def encode(self, states: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
@@ -96,24 +96,24 @@ def valid_steps(states: Tensor, length: Tensor) -> Tensor:
     return torch.arange(states.shape[1], device=states.device) < length.unsqueeze(-1)
 
 
-METHODS: dict[str, type[TraitModel]] = {}
+TRAIT_METHODS: dict[str, type[TraitModel]] = {}
 
 
 def register(model: type[TraitModel]) -> type[TraitModel]:
     """Class decorator: make a method known under ``model.method``."""
-    if model.method in METHODS:
+    if model.method in TRAIT_METHODS:
         raise ValueError(f"two trait methods are called {model.method!r}")
-    METHODS[model.method] = model
+    TRAIT_METHODS[model.method] = model
     return model
 
 
-def find_method(name: Any) -> type[TraitModel]:
+def find_trait_method(name: Any) -> type[TraitModel]:
     """The method called ``name``.
 
     Raises:
         InputError: there is none.
     """
     refuse_old_name(name)
-    if name not in METHODS:
-        raise InputError(f"unknown trait method {name!r}; choose one of: {', '.join(sorted(METHODS))}")
-    return METHODS[name]
+    if name not in TRAIT_METHODS:
+        raise InputError(f"unknown trait method {name!r}; choose one of: {', '.join(sorted(TRAIT_METHODS))}")
+    return TRAIT_METHODS[name]

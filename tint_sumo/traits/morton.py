@@ -4,13 +4,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tint_sumo.config import LATENT_SIZE, EpisodeRules, TraitSettings
-from tint_sumo.traits.batches import Batch
+from tint_sumo.config import LATENT_SIZE, STEP_S, TraitSettings
+from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import kl_divergence, perceptron, sample
 from tint_sumo.traits.model import FEATURE_SPREAD, FEATURES, TraitModel, displacement_and_gap, register
 
 POLICY_LAYERS = 3  # hidden layers of decoder_output_size (code: 3 x 128)
-_STEP_S = EpisodeRules.step_s
 
 
 @register
@@ -35,9 +34,9 @@ class Morton(TraitModel):
         """Displacement (m), gap (m) and acceleration (m/s2)."""
         features = displacement_and_gap(states)
         change = features[..., :1].diff(dim=1, prepend=features[:, :1, :1])
-        return torch.cat((features, change / _STEP_S**2), dim=-1)
+        return torch.cat((features, change / STEP_S**2), dim=-1)
 
-    def loss(self, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
+    def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:
         """Terms ``kl`` (nats per window) and ``imitation`` (mean square of the scaled accelerations)."""
         features = self.features(batch.states, batch.length)
         mean, log_var = self.encoder(features, batch.length)
@@ -47,12 +46,12 @@ class Morton(TraitModel):
         total = self.settings.kl_weight * kl + self.settings.reconstruction_weight * imitation
         return {"kl": kl, "imitation": imitation, "total": total}
 
-    def squared_errors_m2(self, batch: Batch) -> Tensor:
+    def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
         """Of the next positions, each predicted from the true ones before it."""
         features = self.features(batch.states, batch.length)
         mean, _ = self.encoder(features, batch.length)
         chosen, driven = self._accelerations(features, mean, batch.length)
-        return ((chosen - driven) * self.feature_scale[2] * _STEP_S**2).square()
+        return ((chosen - driven) * self.feature_scale[2] * STEP_S**2).square()
 
     def _accelerations(self, features: Tensor, latent: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
         """Scaled accelerations (M,) from each state with a speed to the next one: the policy's and the driver's."""

@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from tint_sumo.config import TraitSettings
 from tint_sumo.errors import InputError, refuse_old_name
 from tint_sumo.files import read_json, shipped, whole_file, write_json
-from tint_sumo.traits.model import METHODS, TraitModel
+from tint_sumo.traits.model import TRAIT_METHODS, TraitModel
 
 RUN_MODEL = "model"  # name of the model in the folder of a training run
 
@@ -100,9 +100,9 @@ def _is_trait_model(weights: Path) -> bool:
 def _checked_card(stem: Path) -> dict[str, Any]:
     card = read_json(_card_file(stem), "card of the trait model")
     method, latent_size, settings = (card.get(key) for key in ("method", "latent_size", "settings"))
-    if method not in METHODS or not isinstance(latent_size, int) or not isinstance(settings, dict):
+    if method not in TRAIT_METHODS or not isinstance(latent_size, int) or not isinstance(settings, dict):
         raise InputError(
-            f"{_card_file(stem)} is not the card of a trait model (methods: {', '.join(sorted(METHODS))}); "
+            f"{_card_file(stem)} is not the card of a trait model (methods: {', '.join(sorted(TRAIT_METHODS))}); "
             "restore the file or train the model again"
         )
     return card
@@ -113,7 +113,7 @@ def _build(card: Mapping[str, Any], stem: Path) -> TraitModel:
         key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"].items()
     }
     try:
-        return METHODS[card["method"]](TraitSettings(**settings), card["latent_size"])
+        return TRAIT_METHODS[card["method"]](TraitSettings(**settings), card["latent_size"])
     except (TypeError, ValueError, RuntimeError, IndexError) as error:
         raise InputError(
             f"{_card_file(stem)}: unusable settings ({error}); restore the file or train the model again"

@@ -5,8 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tint_sumo.config import WINDOW_STEPS
-from tint_sumo.dataset.recorder import MIN_WINDOW_STEPS
+from tint_sumo.config import MIN_WINDOW_STEPS, WINDOW_STEPS
 from tint_sumo.traits.cross_window import CrossWindow
 
 

@@ -18,8 +18,8 @@ from tint_sumo.dataset.windows import Windows
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file
 from tint_sumo.progress import make_bar
-from tint_sumo.traits.batches import Batch, TrainingWindows
-from tint_sumo.traits.model import TraitModel, find_method
+from tint_sumo.traits.batches import TrainingWindows, WindowBatch
+from tint_sumo.traits.model import TraitModel, find_trait_method
 from tint_sumo.traits.storage import RUN_MODEL, load, save
 
 CHECKPOINT_FILE = "checkpoint.pt"
@@ -49,7 +49,7 @@ def train(
         windows: training windows only; the caller keeps the test episodes out.
         settings: sizes, loss weights and schedule.
         out: a new folder, or the one of this very run.
-        method: a name in ``METHODS``.
+        method: a name in ``TRAIT_METHODS``.
         seed: of the initial weights, the order of windows and all noise.
         latent_size: numbers that represent a trait.
         conservative: (N,) the true traits, for a method that is trained with them; no other method may have them.
@@ -62,7 +62,7 @@ def train(
     Raises:
         InputError: unknown method, no windows, ``out`` holds another run, or its checkpoint is damaged.
     """
-    model_type = find_method(method)
+    model_type = find_trait_method(method)
     if len(windows.length) == 0:
         raise InputError("there are no windows to train on; record a dataset with more of them")
     if model_type.uses_labels is not (conservative is not None):
@@ -110,7 +110,7 @@ class _Run:
 
         Each epoch draws from a generator of its own, so a checkpoint needs no generator states.
         """
-        everything = Batch(self.data.states, self.data.length)
+        everything = WindowBatch(self.data.states, self.data.length)
         measured = everything.with_noise(self.settings.noise_m, self._generator(0))
         self.model.fit_features(measured.states, measured.length)
         done, loss = self._resume(checkpoint)
@@ -150,7 +150,7 @@ class _Run:
             bar.update(len(index))
         return {name: value / len(starts) for name, value in sums.items()}
 
-    def _step(self, batch: Batch, remaining: float, generator: torch.Generator) -> dict[str, float]:
+    def _step(self, batch: WindowBatch, remaining: float, generator: torch.Generator) -> dict[str, float]:
         """One gradient step at the fraction ``remaining`` of the learning rate; the loss terms."""
         for group in self.optimiser.param_groups:
             group["lr"] = self.settings.learning_rate * remaining

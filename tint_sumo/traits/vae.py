@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tint_sumo.config import LATENT_SIZE, TraitSettings
-from tint_sumo.traits.batches import Batch
+from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import kl_divergence, perceptron, sample
 from tint_sumo.traits.model import FEATURES, TraitModel, register, valid_steps
 
@@ -51,7 +51,7 @@ class Vae(TraitModel):
         offset = displacement[:, 1:].cumsum(dim=1)
         return torch.stack((functional.pad(offset, (1, 0)), gap), dim=-1)
 
-    def loss(self, batch: Batch, generator: torch.Generator) -> dict[str, Tensor]:
+    def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:
         """Terms ``kl`` (nats per window) and ``reconstruction`` (mean square of the features of valid steps)."""
         features = self.features(batch.states, batch.length)
         mean, log_var = self.encoder(features, batch.length)
@@ -64,7 +64,7 @@ class Vae(TraitModel):
         total = self.settings.kl_weight * terms["kl"] + self.settings.reconstruction_weight * terms["reconstruction"]
         return {**terms, "total": total}
 
-    def squared_errors_m2(self, batch: Batch) -> Tensor:
+    def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
         """Of the reconstructed offsets, from the second step on."""
         offset = self.reconstruct(batch.states, batch.length)[..., 0]
         moving = valid_steps(batch.states, batch.length)[:, 1:]

@@ -1,63 +1,54 @@
-"""The whole scenario as files that plain ``sumo -c tint.sumocfg`` runs."""
+"""A scene as files that plain ``sumo -c tint.sumocfg`` runs."""
 
 from pathlib import Path
 
-from tint_sumo.config import Scenario
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_text
-from tint_sumo.scenario.drivers import DISTRIBUTION_ID, vtypes_xml
-from tint_sumo.scenario.network import (
-    EGO_ROUTE,
-    LOWER_ROUTE,
-    REPLICA_SPACING_M,
-    UPPER_ROUTE,
-    build_network,
-    name,
-    plain_xml,
-)
+from tint_sumo.scenes.drivers import DISTRIBUTION_ID, vtypes_xml
+from tint_sumo.scenes.layout import EGO
+from tint_sumo.scenes.network import REPLICA_SPACING_M, build_network, name, plain_xml
+from tint_sumo.scenes.scene import Scene
 
 NET_FILE = "tint.net.xml"
 DRIVERS_FILE = "drivers.add.xml"
 ROUTES_FILE = "routes.add.xml"
 CONFIG_FILE = "tint.sumocfg"
-DEMO_POISSON_RATE_PER_S = 0.2  # per lane; about two thirds of saturation
-_SATURATED_RATE_PER_S = 1.0  # more than a lane can take: drivers who find no room are not kept waiting
-_MARK = "<!-- Written by tint-sumo net; change tint_sumo/scenario and run it again. -->\n"
+DEMO_POISSON_RATE_PER_S = 0.2  # per route; about two thirds of saturation
+_SATURATED_RATE_PER_S = 1.0  # more than a road can take: drivers who find no room are not kept waiting
+_WRITTEN_BY = "<!-- Written by tint-sumo net"
+_MARK = f"{_WRITTEN_BY}; change tint_sumo/scenes and run it again. -->\n"
 
 
-def scenario_files(
-    replicas: int, scenario: Scenario | None = None, spacing_m: float = REPLICA_SPACING_M
-) -> dict[str, str]:
-    """Name and text of every file of the scenario; ``spacing_m`` as in :func:`plain_xml`.
+def scene_files(scene: Scene, replicas: int, spacing_m: float = REPLICA_SPACING_M) -> dict[str, str]:
+    """Name and text of every file of a scene; ``spacing_m`` as in :func:`~tint_sumo.scenes.network.plain_xml`.
 
     Raises:
         InputError: fewer than one replica.
     """
     if replicas < 1:
         raise InputError(f"replicas must be at least 1, not {replicas}")
-    scenario = scenario or Scenario()
-    sources = plain_xml(replicas, scenario.street, scenario.vehicle, spacing_m)
+    sources = plain_xml(scene.network, replicas, spacing_m)
     texts = {
         "tint.nod.xml": sources.nodes,
         "tint.edg.xml": sources.edges,
         "tint.con.xml": sources.connections,
         NET_FILE: build_network(sources),
-        DRIVERS_FILE: vtypes_xml(scenario.population, scenario.traffic.mean_p_conservative, scenario.vehicle),
-        ROUTES_FILE: _routes_xml(replicas),
-        "saturated.rou.xml": _flows_xml(replicas, f"exp({_SATURATED_RATE_PER_S:g})"),
-        "poisson.rou.xml": _flows_xml(replicas, f"exp({DEMO_POISSON_RATE_PER_S:g})"),
-        CONFIG_FILE: _config_xml(scenario.episode.step_s),
+        DRIVERS_FILE: vtypes_xml(scene.population, scene.traffic.mean_p_conservative, scene.vehicle),
+        ROUTES_FILE: _routes_xml(scene, replicas),
+        "saturated.rou.xml": _flows_xml(scene, replicas, f"exp({_SATURATED_RATE_PER_S:g})"),
+        "poisson.rou.xml": _flows_xml(scene, replicas, f"exp({DEMO_POISSON_RATE_PER_S:g})"),
+        CONFIG_FILE: _config_xml(scene.step_s),
     }
     return {file: _marked(text) for file, text in texts.items()}
 
 
-def write_scenario(folder: Path, replicas: int, scenario: Scenario | None = None) -> list[Path]:
-    """Write the scenario into ``folder`` and return the paths.
+def write_scene(folder: Path, scene: Scene, replicas: int) -> list[Path]:
+    """Write the scene's files into ``folder`` and return the paths.
 
     Raises:
         InputError: a file of the same name exists that this function did not write.
     """
-    texts = scenario_files(replicas, scenario)
+    texts = scene_files(scene, replicas)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder; choose another --out")
     foreign = [file for file in texts if (folder / file).exists() and not _is_ours(folder / file)]
@@ -69,7 +60,7 @@ def write_scenario(folder: Path, replicas: int, scenario: Scenario | None = None
 
 
 def _is_ours(path: Path) -> bool:
-    return _MARK.strip() in path.read_text(encoding="utf-8", errors="replace")
+    return _WRITTEN_BY in path.read_text(encoding="utf-8", errors="replace")
 
 
 def _marked(text: str) -> str:
@@ -80,8 +71,8 @@ def _marked(text: str) -> str:
     return _MARK + text
 
 
-def _routes_xml(replicas: int) -> str:
-    routes = {"lower": LOWER_ROUTE, "upper": UPPER_ROUTE, "ego": EGO_ROUTE}
+def _routes_xml(scene: Scene, replicas: int) -> str:
+    routes = {route.name: route.edges for route in scene.routes} | {EGO: scene.ego.edges}
     lines = [
         f'    <route id="{name(route, replica)}" edges="{" ".join(name(edge, replica) for edge in edges)}"/>'
         for replica in range(replicas)
@@ -90,12 +81,12 @@ def _routes_xml(replicas: int) -> str:
     return "\n".join(["<additional>", *lines, "</additional>", ""])
 
 
-def _flows_xml(replicas: int, period: str) -> str:
+def _flows_xml(scene: Scene, replicas: int, period: str) -> str:
     lines = [
-        f'    <flow id="{name(lane, replica)}" route="{name(lane, replica)}" type="{DISTRIBUTION_ID}" begin="0" '
-        f'period="{period}" departPos="base" departSpeed="desired"/>'
+        f'    <flow id="{name(route.name, replica)}" route="{name(route.name, replica)}" type="{DISTRIBUTION_ID}" '
+        f'begin="0" period="{period}" departPos="base" departSpeed="desired"/>'
         for replica in range(replicas)
-        for lane in ("lower", "upper")
+        for route in scene.routes
     ]
     return "\n".join(["<routes>", *lines, "</routes>", ""])
 

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, POPULATIONS, Population, VehicleShape
-from tint_sumo.scenario.drivers import members, vtypes_xml
+from tint_sumo.scenes import T_INTERSECTION, find_scene
+from tint_sumo.scenes.drivers import members, vtypes_xml
+from tint_sumo.scenes.layout import layout
+from tint_sumo.simulation.demand import DriverPool, DriverStream
 
 
 def test_members_follow_the_papers_traits() -> None:
@@ -48,3 +51,21 @@ def test_a_continuous_population_has_independent_speeds_and_gaps() -> None:
     xml = vtypes_xml(population, 0.3, VehicleShape())
     probabilities = ElementTree.fromstring(xml).find("vTypeDistribution").attrib["probabilities"].split()
     assert sum(map(float, probabilities)) == pytest.approx(1.0, rel=1e-3)
+
+
+def test_profiles_are_drawn_by_their_weights_in_plain_sumo_and_in_the_environments() -> None:
+    """Two thirds of the yielding drivers are conservative here, one third is patient."""
+    patient = replace(CONSERVATIVE, name="patient", weight=0.5)
+    population = Population((CONSERVATIVE, patient, AGGRESSIVE), members=8)
+    xml = vtypes_xml(population, 0.4, VehicleShape())
+    line = next(line for line in xml.splitlines() if "probabilities" in line)
+    weights = np.array([float(weight) for weight in line.split('"')[1].split()])
+    names = np.array([driver.profile.name for driver in members(population)])
+    shares = {"conservative": 0.4 * 2 / 3, "patient": 0.4 / 3, "aggressive": 0.6}
+    for name, share in shares.items():
+        assert weights[names == name].sum() == pytest.approx(share, rel=1e-4)
+    pool = DriverPool(members(population), layout(replace(find_scene(T_INTERSECTION), population=population)))
+    stream = DriverStream(np.random.default_rng(0), pool, 0.4)
+    drawn = Counter(names[stream.take().member] for _ in range(4000))
+    for name, share in shares.items():
+        assert drawn[name] / 4000 == pytest.approx(share, abs=0.03)

@@ -3,6 +3,7 @@
 Source: https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_Types,_and_Routes.html
 """
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ class DriverMember:
 
 
 def members(population: Population) -> tuple[DriverMember, ...]:
-    """All vTypes of a population, profile by profile, ``population.members`` each."""
+    """All vTypes of a population, profile by profile, as many of each as its weight says."""
     gaps, speeds = (np.random.default_rng(seed) for seed in (population.seed, (population.seed, 1)))
     return tuple(
         DriverMember(
@@ -36,16 +37,16 @@ def members(population: Population) -> tuple[DriverMember, ...]:
             idm=population.idm,
         )
         for profile in population.profiles
-        for index in range(population.members)
+        for index in range(max(1, round(population.members * profile.weight)))
     )
 
 
 def vtypes_xml(population: Population, p_conservative: float, vehicle: VehicleShape) -> str:
     """SUMO additional file with every vType, the distribution with P(conservative) and the ego's type."""
     drivers = members(population)
-    mixed = len({member.profile.yields for member in drivers}) == 2
-    weight = {True: p_conservative, False: 1.0 - p_conservative} if mixed else {True: 1.0, False: 1.0}
-    probabilities = [weight[member.profile.yields] / population.members for member in drivers]
+    count = Counter(member.profile.yields for member in drivers)
+    share = {True: p_conservative, False: 1.0 - p_conservative} if len(count) == 2 else {True: 1.0, False: 1.0}
+    probabilities = [share[member.profile.yields] / count[member.profile.yields] for member in drivers]
     # SUMO cuts the corners off a passenger car's shape before it looks for collisions; a van keeps its full box.
     shape = f'guiShape="delivery" length="{vehicle.length_m:g}" width="{vehicle.width_m:g}"'
     lines = [

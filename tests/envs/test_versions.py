@@ -1,0 +1,41 @@
+"""Episodes of an environment never change within a version of its id: trained policies rely on that."""
+
+import hashlib
+
+import gymnasium
+import numpy as np
+
+from tint_sumo import ENV_IDS
+from tint_sumo.envs.batch import LocalBatch
+from tint_sumo.envs.vector import SceneVectorEnv
+from tint_sumo.scenes import T_INTERSECTION
+
+# Of the states under the actions below, computed when TIntersection-v1 was registered.
+T_INTERSECTION_V1 = "845b4ba7b9c15091bd26cb1fd64ee7697bb1266f0c2cf7136772ea95e2f3f6e7"
+
+
+def test_episodes_of_the_t_intersection_are_those_of_its_version() -> None:
+    replicas, steps, rng = 16, 450, np.random.default_rng(7)
+    chosen = rng.integers(0, 3, (steps // 5 + 1, replicas))
+    goes = rng.random((steps // 5 + 1, replicas)) < 0.5
+    actions = np.where(goes, 2, chosen).repeat(5, axis=0)[:steps]
+    env = gymnasium.make_vec(
+        ENV_IDS[T_INTERSECTION],
+        num_envs=replicas,
+        vectorization_mode="vector_entry_point",
+        p_conservative=(0.1, 0.9),
+    )
+    assert isinstance(env, SceneVectorEnv) and isinstance(env.batch, LocalBatch)
+    simulation, found = env.batch.episodes.simulation, hashlib.sha256()
+    try:
+        env.reset(seed=3)
+        for taken in actions:
+            _, _, terminated, truncated, _ = env.step(taken)
+            slots, egos = simulation.slots, simulation.egos
+            of_slots = (slots.route, slots.front_m, slots.member, slots.vehicle_number, simulation.yielding.reacts)
+            of_egos = (egos.front_m, egos.speed_mps, egos.has_claimed, simulation.time_s, terminated | truncated)
+            for values in (*(np.where(slots.present, one, -1) for one in of_slots), *of_egos):
+                found.update(values.astype(float).tobytes())
+    finally:
+        env.close()
+    assert found.hexdigest() == T_INTERSECTION_V1

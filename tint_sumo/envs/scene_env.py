@@ -1,0 +1,199 @@
+"""The single environment."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_actions
+from tint_sumo.envs.rendering import RENDER_FPS, render_scene, require_render_mode
+from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, outcome_name
+from tint_sumo.errors import InputError
+from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """How an episode has come to where it is: it follows from its seed and the actions so far."""
+
+    began: dict[str, Any]  # state of the environment's generator that the seed was drawn from
+    actions: tuple[int, ...]
+
+
+class SceneEnv(gymnasium.Env[Any, Any]):
+    """Cross or join the traffic of a scene, among drivers whose traits are unknown.
+
+    ## Description
+    One intersection simulated by Eclipse SUMO. In the scene of Liu et al. (ICRA 2022), `tint_sumo/TIntersection-v1`,
+    an uncontrolled T-intersection with left-hand traffic, the ego comes up the stem, crosses the lower lane (westbound)
+    and merges into the upper lane (eastbound). The other scenes are listed in `tint_sumo.scenes.SCENES`. Conservative
+    drivers yield to an ego that moves into their lane while they can still stop clear of its way; aggressive
+    drivers do not and hit it. The ego's path is fixed; the agent chooses its desired speed, which a PD controller
+    follows and a safety check can override.
+
+    ## Action Space
+    `Discrete(3)`: desired speed 0, 0.5 or 3 m/s.
+
+    ## Observation Space
+    A `Dict` of float32 arrays, lengths divided by 20 m, speeds by 3 m/s, clipped to [-2, 2]; V is the scene's
+    `max_vehicles`, 12 in the T-intersection:
+
+    | Key        | Shape    | Content                                                                            |
+    |------------|----------|------------------------------------------------------------------------------------|
+    | `ego`      | `(4,)`   | x, y, x velocity, y velocity of the ego's centre in the scene's frame              |
+    | `vehicles` | `(V, 2)` | x, y of each vehicle's centre minus the ego's, with noise; 0 in empty slots        |
+    | `mask`     | `(V,)`   | 1 where the slot holds a vehicle                                                   |
+
+    A vehicle keeps its slot for as long as it is on the roads; a slot stays empty for at least one step between two
+    vehicles. The others' velocities and traits are not observed.
+
+    ## Rewards
+    The sum of named terms, also found in `info["reward_terms"]`:
+
+    | Term        | Paper                             | `reward="authors"`                |
+    |-------------|-----------------------------------|-----------------------------------|
+    | `goal`      | 2.5 at the goal                   | 2.5                               |
+    | `collision` | -2 on collision                   | -2                                |
+    | `speed`     | 0.05 x ego speed (m/s) otherwise  | 0.05 / 3 x ego speed otherwise    |
+    | `step`      | -0.0013 otherwise                 | -0.013 otherwise                  |
+
+    ## Starting State
+    The ego stands at its start (in the T-intersection with its centre at (0, -5)). All of the traffic's routes are
+    filled at random; each driver is conservative with probability `p_conservative`.
+
+    ## Episode End
+    Termination: the ego passes its goal (`success`; in the T-intersection its centre is at x = 8 m on the upper lane
+    then), or its box touches another vehicle's (`collision`). Truncation: the time limit (`timeout`).
+
+    ## Information
+    | Key            | Content                                                                                     |
+    |----------------|---------------------------------------------------------------------------------------------|
+    | `traits`       | `(V,)` int8, true traits: number of the driver's profile, 0 conservative and 1 aggressive;  |
+    |                | -1 in empty slots                                                                           |
+    | `position_m`   | with `tracks`: `(V,)` where each vehicle's front is seen on its route; 0 in empty slots     |
+    | `gap_m`        | with `tracks`: `(V,)` the gap that is seen to the next vehicle ahead; infinite without one  |
+    | `passed`       | with `tracks`: `(V,)` int8, 1 where the ego has left the vehicle's route behind             |
+    | `outcome`      | `"success"`, `"collision"`, `"timeout"`, or `""` while the episode goes on                  |
+    | `reward_terms` | the reward's named terms (after a step)                                                     |
+    | `time_s`       | time since the episode's start                                                              |
+    | `collision`    | after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`                 |
+
+    ## Arguments
+    * `scene`: name of a scene, a `tint_sumo.scenes.Scene`, or what `tint_sumo.scenes.from_sumocfg` makes of a SUMO
+      configuration of your own. Then the traffic is the configuration's, several lanes and changes between them
+      included; `ego` is seen from where it starts, with the network's axes; `vehicles` are the nearest in sight;
+      `traits` are the numbers of their vTypes in `scene.vtypes`; `position_m` is what their odometers show, and
+      `passed` is always 0. Such an environment is one simulation: a vector of them needs as many `workers` as
+      environments.
+    * `p_conservative`: probability that a driver is conservative, in [0, 1]; default 0.4. Two numbers are a range, from
+      which each episode draws its probability uniformly, by its seed.
+    * `reward`: `"paper"` (default) or `"authors"` (the values of the authors' code).
+    * `time_limit_s`: default 50 s.
+    * `position_noise_m`: standard deviation of the noise on the others' x and y, independent per vehicle and step.
+    * `tau_s`: time headway of the others' car following (SUMO's `tau`); default 1 s.
+    * `tracks`: tell in the infos, too, where vehicles are seen on their routes, with the same noise as in the
+      observations; that is what trait models take. Default False.
+    * `backend`: `"libsumo"`, `"traci"` (a sumo subprocess), or `"auto"` (default): libsumo if no other environment of
+      this process uses it, since libsumo holds one simulation per process.
+    * `render_mode`: `None` or `"rgb_array"`.
+
+    ## Version History
+    TIntersection:
+    * v1: a conservative driver that can no longer stop clear of the ego's way drives on. Before, it braked and stood so
+      close that the ego's safety check held the ego: both waited until the time limit, in up to 28 % of the episodes.
+      `p_conservative` takes a range; new argument `tau_s`.
+    * v0: first release.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012 - gymnasium's way
+
+    def __init__(
+        self, scene: str | Scene | OwnScene = T_INTERSECTION, render_mode: str | None = None, **task: Any
+    ) -> None:
+        require_render_mode(render_mode)
+        self.render_mode = render_mode
+        settings = TaskSettings(scene, **task)
+        self.observation_space = observation_space(settings.played.max_vehicles)
+        self.action_space: gymnasium.spaces.Discrete = action_space(settings.played)
+        self._slot_infos = settings.slot_infos
+        self._episodes = Episodes(1, settings)
+        self._began: dict[str, Any] = {}
+        self._actions: list[int] = []
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,  # noqa: ARG002 - gymnasium's signature; there are none
+    ) -> tuple[Observation, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._begin()
+        told = self._told()
+        return _observation(told), self._info(told)
+
+    def _begin(self) -> None:
+        self._began = dict(self.np_random.bit_generator.state)
+        self._actions = []
+        self._episodes.begin(0, self.np_random)
+
+    def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        actions = np.array([action])
+        require_actions(actions, 1, int(self.action_space.n))
+        self._step(actions)
+        told = self._told()
+        info = self._info(told)
+        info["reward_terms"] = {term: told[term] for term in REWARD_TERMS}
+        if info["outcome"] == "collision":
+            info["collision"] = self._episodes.collision_info(0)
+        return _observation(told), told["reward"], told["terminated"], told["truncated"], info
+
+    def _step(self, actions: NDArray[np.int64]) -> None:
+        self._actions.append(int(actions[0]))
+        self._episodes.step(actions)
+
+    def snapshot(self) -> Snapshot:
+        """What :meth:`restore` needs to come back to where the episode is now; it can be pickled.
+
+        Raises:
+            InputError: no episode has begun.
+        """
+        if not self._began:
+            raise InputError("there is no episode to come back to; reset the environment first")
+        return Snapshot(self._began, tuple(self._actions))
+
+    def restore(self, snapshot: Snapshot) -> tuple[Observation, dict[str, Any]]:
+        """Go back, or to another environment's episode with the same arguments; the observation and info there.
+
+        The episode is simulated once more up to there, which takes as long as it took: SUMO's own saved states do not
+        hold all that its vehicles remember, and would not go on to the last bit as the episode did.
+        """
+        self.np_random.bit_generator.state = snapshot.began
+        self._begin()
+        for action in snapshot.actions:
+            self._step(np.array([action]))
+        told = self._told()
+        return _observation(told), self._info(told)
+
+    def _info(self, told: dict[str, Any]) -> dict[str, Any]:
+        slots = {key: told[key].copy() for key in self._slot_infos}
+        return {**slots, "outcome": outcome_name(told["outcome"]), "time_s": told["time_s"]}
+
+    def _told(self) -> dict[str, Any]:
+        """The row's fields as Python's numbers, and arrays that the next step overwrites."""
+        rows = self._episodes.rows
+        return dict(zip(rows.dtype.names or (), rows.item(), strict=True))
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """(H, W, 3) image of the scene; conservative drivers blue, aggressive red, the ego yellow."""
+        if self.render_mode is None:
+            return None
+        return render_scene(self._episodes.simulation, 0)
+
+    def close(self) -> None:
+        self._episodes.simulation.close()
+
+
+def _observation(told: dict[str, Any]) -> Observation:
+    return {key: told[key].copy() for key in OBSERVATION_KEYS}

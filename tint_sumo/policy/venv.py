@@ -1,0 +1,37 @@
+"""The environments a policy is trained and tested in: a scene, traits in its observations, decisions now and then."""
+
+from typing import Any
+
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+
+from tint_sumo.envs.sb3 import SceneVecEnv
+from tint_sumo.policy.action_repeat import ActionRepeat
+from tint_sumo.policy.trait_observation import TRUE_TRAITS, TraitObservation
+from tint_sumo.policy.trait_sources import OracleTraits, TraitSource
+
+
+def policy_venv(
+    num_envs: int,
+    source: TraitSource | None,
+    *,
+    action_repeat: int = 1,
+    critic_sees_true_traits: bool = False,
+    monitored: bool = False,
+    **task: Any,
+) -> VecEnv:
+    """``num_envs`` environments of a scene, with what a policy needs around them.
+
+    Args:
+        num_envs: number of environments.
+        source: where the traits in the observations come from; None leaves them out.
+        action_repeat: simulation steps per decision.
+        critic_sees_true_traits: observe the true traits, too, under a key of their own.
+        monitored: count steps and rewards of each episode for Stable-Baselines3's logger.
+        task: as in :class:`~tint_sumo.envs.scene_env.SceneEnv`.
+    """
+    venv: VecEnv = SceneVecEnv(num_envs, tracks=source is not None and source.needs_tracks, **task)
+    if source is not None:
+        venv = TraitObservation(venv, source)
+    if critic_sees_true_traits:
+        venv = TraitObservation(venv, OracleTraits(), TRUE_TRAITS)
+    return ActionRepeat(VecMonitor(venv) if monitored else venv, action_repeat)

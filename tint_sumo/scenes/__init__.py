@@ -1,0 +1,10 @@
+"""Scenes: roads, routes, the ego's task and who drives. Each scene is one module, imported here once."""
+
+from tint_sumo.scenes import four_way as four_way
+from tint_sumo.scenes import on_ramp as on_ramp
+from tint_sumo.scenes import roundabout as roundabout
+from tint_sumo.scenes import t_intersection as t_intersection
+from tint_sumo.scenes.own import OwnScene, from_sumocfg
+from tint_sumo.scenes.scene import SCENES, T_INTERSECTION, EgoTask, Route, Scene, View, find_scene
+
+__all__ = ["SCENES", "T_INTERSECTION", "EgoTask", "OwnScene", "Route", "Scene", "View", "find_scene", "from_sumocfg"]

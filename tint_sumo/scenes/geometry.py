@@ -1,0 +1,280 @@
+"""Where things are: ways by arc length, the poses of the boxes that drive along them, and distances between boxes.
+
+A way is the trace of a front bumper, as points at every ``SPACING_M`` of its arc length. SUMO leads the front along the
+lanes' shapes, and the back along the same shapes a vehicle's length behind; so it is here.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from tint_sumo.compiling import compiled
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Numbers = NDArray[np.int64]
+
+SPACING_M = 0.02  # a chord of a circle of 6 m lies within 0.01 mm of it
+
+# A box's centre and unit heading.
+POSE = np.dtype([(part, np.float64) for part in ("x_m", "y_m", "heading_x", "heading_y")])
+Poses = NDArray[np.void]  # of POSE
+
+
+def resample(points: Floats, length_m: float) -> Floats:
+    """Points (P, 2) at every ``SPACING_M`` up to a length, of a polyline (N, 2) that goes straight on at its end."""
+    step_m = np.hypot(*np.diff(points, axis=0).T)
+    keep = np.r_[True, step_m > 0.0]
+    points, step_m = points[keep], step_m[step_m > 0.0]
+    along_m = np.r_[0.0, np.cumsum(step_m)]
+    wanted_m = np.arange(math.ceil(length_m / SPACING_M) + 2) * SPACING_M
+    inside = np.stack([np.interp(wanted_m, along_m, points[:, axis]) for axis in range(2)], axis=1)
+    beyond_m = np.maximum(wanted_m - along_m[-1], 0.0)
+    return np.asarray(inside + beyond_m[:, None] * (points[-1] - points[-2]) / step_m[-1])
+
+
+def along(way: Floats) -> Floats:
+    """Arc lengths (P,) of a way's points (P, 2)."""
+    return np.asarray(np.arange(len(way)) * SPACING_M)
+
+
+def as_line(way: Floats) -> shapely.LineString:
+    """A way as a line of few points, within a millimetre of it."""
+    return shapely.LineString(way).simplify(1e-3)
+
+
+def project(points: Floats, line: shapely.LineString) -> tuple[Floats, Floats]:
+    """How far along a line the points nearest to some points (N, 2) lie, and how far off they are; both (N,)."""
+    found = shapely.points(points)
+    return shapely.line_locate_point(line, found), shapely.distance(line, found)
+
+
+@compiled
+def way_point(way: Floats, along_m: float) -> tuple[float, float]:
+    """The point of a way (P, 2) at an arc length; beyond its ends it goes straight on."""
+    steps = along_m / SPACING_M
+    index = min(max(int(steps), 0), way.shape[0] - 2)
+    part = steps - index
+    x_m = way[index, 0] + part * (way[index + 1, 0] - way[index, 0])
+    y_m = way[index, 1] + part * (way[index + 1, 1] - way[index, 1])
+    return x_m, y_m
+
+
+@compiled
+def place_one(front_m: float, way: Floats, length_m: float, pose: Any) -> None:
+    """Write the pose, one record, of a box whose front has come so far along its way."""
+    front_x_m, front_y_m = way_point(way, front_m)
+    back_x_m, back_y_m = way_point(way, front_m - length_m)
+    along_x_m, along_y_m = front_x_m - back_x_m, front_y_m - back_y_m
+    norm_m = math.hypot(along_x_m, along_y_m)
+    pose.heading_x, pose.heading_y = along_x_m / norm_m, along_y_m / norm_m
+    pose.x_m = front_x_m - length_m / 2 * pose.heading_x
+    pose.y_m = front_y_m - length_m / 2 * pose.heading_y
+
+
+@compiled
+def place(front_m: Floats, way: Floats, length_m: float, poses: Poses) -> None:
+    """Write the poses (N,) of boxes whose fronts (N,) have come so far along one way."""
+    for index in range(len(front_m)):
+        place_one(front_m[index], way, length_m, poses[index])
+
+
+@compiled
+def follow(
+    index: Numbers,
+    lane_pos_m: Floats,
+    route: Numbers,
+    lane_start_m: Floats,
+    ways: Floats,
+    length_m: float,
+    stage: Numbers,
+    was_pos_m: Floats,
+    front_m: Floats,
+    poses: Poses,
+) -> None:
+    """Follow vehicles to where SUMO has them.
+
+    Args:
+        index: (N,) of vehicles in the arrays (S,) of all slots: ``route``, and those written to.
+        lane_pos_m: (N,) of their fronts on their SUMO lanes.
+        lane_start_m: (K, S) where each lane of a route starts.
+        ways: (K, P, 2) of the routes.
+        length_m: of every vehicle.
+        stage, was_pos_m: number of the SUMO lane on the route, and position on it; read and written.
+        front_m, poses: written.
+    """
+    for one in range(len(index)):
+        slot, position_m = index[one], lane_pos_m[one]
+        # Vehicles only move forward: a lane position that dropped belongs to the next SUMO lane.
+        if position_m < was_pos_m[slot]:
+            stage[slot] += 1
+        was_pos_m[slot] = position_m
+        front_m[slot] = lane_start_m[route[slot], stage[slot]] + position_m
+        place_one(front_m[slot], ways[route[slot]], length_m, poses[slot])
+
+
+@compiled
+def find_leaders(
+    present: Bools,
+    route: Numbers,
+    stage: Numbers,
+    front_m: Floats,
+    lane_start_m: Floats,
+    lane_on_route_m: Floats,
+    length_m: float,
+    leader: Numbers,
+    gap_m: Floats,
+) -> None:
+    """Write the slot of the next vehicle ahead on each vehicle's route, -1 if none, and the gap to it, NaN if none.
+
+    Args:
+        present, route, stage, front_m: (R, V) of the vehicles.
+        lane_start_m: (K, S) where each lane of a route starts.
+        lane_on_route_m: (K, K, S) where on the first route each lane of the second one starts; NaN if it does not.
+        length_m: of every vehicle.
+        leader, gap_m: (R, V) written; the gap is bumper to bumper.
+    """
+    here = np.empty(present.shape[1], np.int64)  # slots of a row that hold a vehicle
+    for row in range(present.shape[0]):
+        count = 0
+        for slot in range(present.shape[1]):
+            leader[row, slot] = -1
+            gap_m[row, slot] = math.nan
+            if present[row, slot]:
+                here[count] = slot
+                count += 1
+        for slot in here[:count]:
+            own, nearest_m = route[row, slot], math.inf
+            for other in here[:count]:
+                theirs, ahead_m = route[row, other], front_m[row, other] - front_m[row, slot]
+                if theirs != own:
+                    lane = stage[row, other]
+                    ahead_m += lane_on_route_m[own, theirs, lane] - lane_start_m[theirs, lane]
+                if 0.0 < ahead_m < nearest_m:  # neither the vehicle itself nor NaN
+                    nearest_m = ahead_m
+                    leader[row, slot] = other
+            if leader[row, slot] >= 0:
+                gap_m[row, slot] = nearest_m - length_m
+
+
+@compiled
+def box_distance_m(
+    dx_m: float,
+    dy_m: float,
+    cos: float,
+    sin: float,
+    length_m: float,
+    width_m: float,
+    turned_length_m: float,
+    turned_width_m: float,
+) -> float:
+    """Shortest distance between two boxes, one along x and the other turned; 0 where they overlap.
+
+    Args:
+        dx_m, dy_m: centre of the box along x, seen from the turned one's.
+        cos, sin: heading of the turned box.
+        length_m, width_m: of the box along x.
+        turned_length_m, turned_width_m: of the turned box.
+    """
+    nearest_m = math.inf
+    apart = False
+    # Two views: the box along x as the turned one has it ahead and abreast, and the turned one as that one has it. Each
+    # box is turned by the same angle in the other's view, to one side and to the other.
+    for ahead_m, abreast_m, turn, seen_length_m, seen_width_m, own_length_m, own_width_m in (
+        (dx_m * cos + dy_m * sin, dy_m * cos - dx_m * sin, -sin, length_m, width_m, turned_length_m, turned_width_m),
+        (dx_m, dy_m, sin, turned_length_m, turned_width_m, length_m, width_m),
+    ):
+        half_length_m, half_width_m = own_length_m / 2, own_width_m / 2
+        low_ahead_m, high_ahead_m, low_abreast_m, high_abreast_m = math.inf, -math.inf, math.inf, -math.inf
+        for along_m in (seen_length_m / 2, -seen_length_m / 2):
+            for across_m in (seen_width_m / 2, -seen_width_m / 2):
+                corner_ahead_m = ahead_m + along_m * cos - across_m * turn
+                corner_abreast_m = abreast_m + along_m * turn + across_m * cos
+                # Disjoint convex polygons are closest at a corner of one of them...
+                outside_ahead_m = max(abs(corner_ahead_m) - half_length_m, 0.0)
+                outside_abreast_m = max(abs(corner_abreast_m) - half_width_m, 0.0)
+                nearest_m = min(nearest_m, math.hypot(outside_ahead_m, outside_abreast_m))
+                low_ahead_m, high_ahead_m = min(low_ahead_m, corner_ahead_m), max(high_ahead_m, corner_ahead_m)
+                low_abreast_m = min(low_abreast_m, corner_abreast_m)
+                high_abreast_m = max(high_abreast_m, corner_abreast_m)
+        # ... and apart along a side of one of them.
+        apart = apart or low_ahead_m >= half_length_m or high_ahead_m <= -half_length_m
+        apart = apart or low_abreast_m >= half_width_m or high_abreast_m <= -half_width_m
+    return nearest_m if apart else 0.0
+
+
+@compiled
+def pose_distance_m(
+    ego: Any, other: Any, length_m: float, width_m: float, other_length_m: float, other_width_m: float
+) -> float:
+    """Shortest distance between the boxes of an ego and another vehicle, both poses; 0 where they overlap."""
+    dx_m, dy_m = other.x_m - ego.x_m, other.y_m - ego.y_m
+    # seen from a frame that heads like the other
+    ahead_m = dx_m * other.heading_x + dy_m * other.heading_y
+    abreast_m = dy_m * other.heading_x - dx_m * other.heading_y
+    cos = ego.heading_x * other.heading_x + ego.heading_y * other.heading_y
+    sin = ego.heading_y * other.heading_x - ego.heading_x * other.heading_y
+    return box_distance_m(ahead_m, abreast_m, cos, sin, other_length_m, other_width_m, length_m, width_m)
+
+
+@compiled
+def measure_distances_m(
+    egos: Poses,
+    present: Bools,
+    vehicles: Poses,
+    reach_m: float,
+    length_m: float,
+    width_m: float,
+    distance_m: Floats,
+) -> None:
+    """Write the distances from each ego's box to the vehicles' boxes.
+
+    Args:
+        egos: (R,).
+        present, vehicles: (R, V) which slots hold a vehicle, and its pose.
+        reach_m: distances beyond it may be written as infinite.
+        length_m, width_m: of every box.
+        distance_m: (R, V) written; infinite for empty slots.
+    """
+    radius_m = math.hypot(length_m, width_m) / 2  # of a box, however it stands
+    for row in range(len(egos)):
+        ego = egos[row]
+        for slot in range(present.shape[1]):
+            other = vehicles[row, slot]
+            dx_m, dy_m = other.x_m - ego.x_m, other.y_m - ego.y_m
+            near = present[row, slot] and abs(dx_m) < reach_m + 2 * radius_m and abs(dy_m) < reach_m + 2 * radius_m
+            if near:
+                distance_m[row, slot] = pose_distance_m(ego, other, length_m, width_m, length_m, width_m)
+            else:
+                distance_m[row, slot] = math.inf
+
+
+@compiled
+def measure_unlike_distances_m(
+    ego: Any,
+    present: Bools,
+    vehicles: Poses,
+    length_m: float,
+    width_m: float,
+    vehicle_length_m: Floats,
+    vehicle_width_m: Floats,
+    distance_m: Floats,
+) -> None:
+    """Write the distances from one ego's box to the boxes of vehicles that each have a size of their own.
+
+    Args:
+        ego: its pose.
+        present, vehicles: (V,) which slots hold a vehicle, and its pose.
+        length_m, width_m: of the ego.
+        vehicle_length_m, vehicle_width_m: (V,).
+        distance_m: (V,) written; infinite for empty slots.
+    """
+    for slot in range(len(present)):
+        distance_m[slot] = math.inf
+        if present[slot]:
+            distance_m[slot] = pose_distance_m(
+                ego, vehicles[slot], length_m, width_m, vehicle_length_m[slot], vehicle_width_m[slot]
+            )

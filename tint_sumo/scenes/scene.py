@@ -1,0 +1,104 @@
+"""A scene as data: a network, the traffic's routes through it, the ego's task, and who drives.
+
+A new scene is a file that makes one, and a line in ``tint_sumo/scenes/__init__.py``.
+"""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+
+from tint_sumo.config import Claim, EgoController, Population, Traffic, VehicleShape
+from tint_sumo.errors import InputError
+from tint_sumo.scenes.network import Network, Point
+
+
+@dataclass(frozen=True)
+class Route:
+    """Edges that vehicles drive along, one after the other, from the network's border to its border."""
+
+    name: str
+    edges: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class EgoTask:
+    """Where the ego drives; arc lengths are those of its front bumper from its route's start."""
+
+    edges: tuple[str, ...]
+    start_m: float
+    goal_m: float  # success when its front is past it
+    way: tuple[Point, ...] = ()  # its front's trace, finer than the lanes' shapes; those if not given
+    controller: EgoController = field(default_factory=EgoController)
+
+
+@dataclass(frozen=True)
+class View:
+    """The part of a network that pictures show, m."""
+
+    left_m: float
+    bottom_m: float
+    right_m: float
+    top_m: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All that defines a simulated episode, apart from its seed.
+
+    Every traffic route begins where a vehicle's back is when it enters, and is long enough for its front to arrive at
+    the route's end just when its centre crosses the border of the modelled roads.
+    """
+
+    name: str
+    title: str  # what the ego does
+    network: Network
+    routes: tuple[Route, ...]
+    ego: EgoTask
+    view: View
+    traffic: Traffic = field(default_factory=Traffic)
+    population: Population = field(default_factory=Population)
+    vehicle: VehicleShape = field(default_factory=VehicleShape)
+    claim: Claim = field(default_factory=Claim)
+    max_vehicles: int = 12  # on the roads, and in an observation (code)
+    step_s: float = 0.1  # code
+    time_limit_s: float = 50.0  # code
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.ego.start_m < self.ego.goal_m:
+            start_m, goal_m = self.ego.start_m, self.ego.goal_m
+            raise InputError(f"the ego's goal ({goal_m:g} m) must lie beyond its start ({start_m:g} m)")
+
+    @property
+    def digest(self) -> str:
+        """What tells the roads, the vehicles and the ego's task from others'; drivers and their mix do not count."""
+        parts = (self.network, self.routes, self.ego, self.vehicle, self.claim, self.step_s, self.max_vehicles)
+        text = repr([part if isinstance(part, int | float | tuple) else asdict(part) for part in parts])
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+T_INTERSECTION = "t_intersection"  # the paper's scene
+
+SCENES: dict[str, Callable[[], Scene]] = {}
+
+
+def register(make: Callable[[], Scene]) -> Callable[[], Scene]:
+    """Make a scene known under the name of the function that makes it.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    if make.__name__ in SCENES:
+        raise ValueError(f"two scenes are called {make.__name__!r}")
+    SCENES[make.__name__] = make
+    return make
+
+
+def find_scene(name: str) -> Scene:
+    """The scene called ``name``.
+
+    Raises:
+        InputError: there is none.
+    """
+    if name not in SCENES:
+        raise InputError(f"unknown scene {name!r}; choose one of: {', '.join(SCENES)}")
+    return SCENES[name]()

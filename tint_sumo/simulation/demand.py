@@ -1,0 +1,181 @@
+"""Who drives on the roads and where they appear: draws from each route's own generator."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from tint_sumo.compiling import compiled
+from tint_sumo.scenes.drivers import DriverMember
+from tint_sumo.scenes.geometry import Bools, Floats, Numbers
+from tint_sumo.scenes.layout import Layout
+from tint_sumo.simulation.slots import Slots
+
+
+@dataclass(frozen=True)
+class PlacedVehicle:
+    """A vehicle of a scene, driving at its driver's desired speed."""
+
+    route: int
+    front_m: float  # front bumper's distance along the route, a vehicle's length at the entry
+    member: int  # index into the population
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A driver about to appear."""
+
+    member: int  # index into the population's members
+    gap_m: float  # bumper gap to the vehicle ahead that it waits for
+    wait_s: float  # time since the driver before it; 0 in saturated traffic
+
+
+class DriverPool:
+    """Whom all routes' streams draw from."""
+
+    def __init__(self, population: tuple[DriverMember, ...], layout: Layout) -> None:
+        self.population = population
+        self.scene = layout.scene
+        everybody = list(range(len(population)))
+        self.by_trait = {  # where all are alike, each share is drawn from all
+            yields: [index for index in everybody if population[index].profile.yields is yields] or everybody
+            for yields in (True, False)
+        }
+        self.mean_gap_m = float(np.mean([gap for member in population for gap in member.profile.entry_gap_m]))
+
+
+class DriverStream:
+    """The endless sequence of drivers on one route; its k-th driver depends on the route's seed and the mix alone.
+
+    Args:
+        p_conservative: probability that a driver of this episode is conservative.
+    """
+
+    def __init__(self, rng: np.random.Generator, pool: DriverPool, p_conservative: float) -> None:
+        self._rng = rng
+        self._pool = pool
+        self._p_conservative = p_conservative
+        self.upcoming = self._draw()
+
+    def _draw(self) -> Driver:
+        rng, pool, traffic = self._rng, self._pool, self._pool.scene.traffic
+        candidates = pool.by_trait[bool(rng.random() < self._p_conservative)]
+        member = candidates[int(rng.integers(len(candidates)))]
+        low_m, high_m = pool.population[member].profile.entry_gap_m
+        gap_m = low_m + (high_m - low_m) * rng.random()
+        wait_s = 0.0 if traffic.arrivals_per_s is None else rng.exponential(1.0 / traffic.arrivals_per_s)
+        return Driver(member, gap_m, wait_s)
+
+    def take(self) -> Driver:
+        """The upcoming driver, who is then followed by a new one."""
+        driver, self.upcoming = self.upcoming, self._draw()
+        return driver
+
+    def placement(self, route_length_m: float) -> Iterator[tuple[Driver, float]]:
+        """Fill the route as an episode starts, from its exit to its entry: drivers and their ``front_m``."""
+        pool, length_m = self._pool, self._pool.scene.vehicle.length_m
+        front_m = route_length_m - (length_m + pool.mean_gap_m) * self._rng.random()
+        while front_m >= length_m:
+            yield self.take(), front_m
+            follower = self.upcoming
+            waited_m = follower.wait_s * pool.population[follower.member].desired_speed_mps
+            front_m -= length_m + follower.gap_m + waited_m
+
+
+class Demand:
+    """Who comes next on each route of R replicas, and when there is room and time for it."""
+
+    def __init__(self, replicas: int, population: tuple[DriverMember, ...], layout: Layout) -> None:
+        shape = (replicas, len(layout.routes))
+        self._layout = layout
+        self._pool = DriverPool(population, layout)
+        self._streams: list[tuple[DriverStream, ...]] = [() for _ in range(replicas)]
+        self._wanted_gap_m: Floats = np.full(shape, np.inf)
+        self._wanted_time_s: Floats = np.zeros(shape)
+        self._admitted: Bools = np.zeros(shape, bool)
+
+    @property
+    def entry_m(self) -> float:
+        """Where the fronts of newcomers are."""
+        return self._layout.scene.vehicle.length_m
+
+    def begin(self, replica: int, seed: np.random.SeedSequence) -> list[PlacedVehicle]:
+        """Start an episode; the vehicles that are on the roads already."""
+        p_conservative = np.random.default_rng(seed).uniform(*self._pool.scene.traffic.p_conservative_range)
+        streams = tuple(
+            DriverStream(np.random.default_rng(child), self._pool, p_conservative)
+            for child in seed.spawn(len(self._layout.routes))
+        )
+        self._streams[replica] = streams
+        placed = [
+            PlacedVehicle(route, front_m, driver.member)
+            for route, stream in enumerate(streams)
+            for driver, front_m in stream.placement(self._layout.routes[route].length_m)
+        ]
+        for route in range(len(streams)):
+            self._expect(replica, route, 0.0)
+        return placed
+
+    def stop(self, replica: int) -> None:
+        """Nobody comes any more."""
+        self._wanted_gap_m[replica] = np.inf
+
+    def admit(self, slots: Slots, time_s: Floats) -> Iterator[tuple[int, int]]:
+        """Replica and route of the drivers for whom there is room, and whose time has come; (R,) times."""
+        if admit(
+            slots.front_m,
+            slots.newest,
+            2 * self.entry_m,
+            self._wanted_gap_m,
+            time_s,
+            self._wanted_time_s,
+            self._admitted,
+        ):
+            rows, routes = np.nonzero(self._admitted)
+            yield from zip(rows.tolist(), routes.tolist(), strict=True)
+
+    def take(self, replica: int, route: int, time_s: float) -> PlacedVehicle:
+        """The driver that enters a route now."""
+        driver = self._streams[replica][route].take()
+        self._expect(replica, route, time_s)
+        return PlacedVehicle(route, self.entry_m, driver.member)
+
+    def _expect(self, replica: int, route: int, time_s: float) -> None:
+        upcoming = self._streams[replica][route].upcoming
+        self._wanted_gap_m[replica, route] = upcoming.gap_m
+        self._wanted_time_s[replica, route] = time_s + upcoming.wait_s
+
+
+@compiled
+def admit(
+    front_m: Floats,
+    newest: Numbers,
+    taken_m: float,
+    wanted_gap_m: Floats,
+    time_s: Floats,
+    wanted_time_s: Floats,
+    admitted: Bools,
+) -> bool:
+    """Tell for whom there is room, and whose time has come.
+
+    Args:
+        front_m: (R, V) of vehicles along their routes.
+        newest: (R, K) slot of the vehicle that entered each route last; -1 for an open road.
+        taken_m: of that front's distance by its own vehicle and by the one that would enter.
+        wanted_gap_m, wanted_time_s: (R, K) of the upcoming drivers; an infinite gap keeps a route closed.
+        time_s: (R,).
+        admitted: (R, K) written.
+
+    Returns:
+        whether anybody is admitted.
+    """
+    any_admitted = False
+    for row in range(len(time_s)):
+        for route in range(newest.shape[1]):
+            last = newest[row, route]
+            has_room = wanted_gap_m[row, route] < np.inf and (
+                last < 0 or front_m[row, last] - taken_m >= wanted_gap_m[row, route]
+            )
+            admitted[row, route] = has_room and time_s[row] >= wanted_time_s[row, route]
+            any_admitted = any_admitted or admitted[row, route]
+    return any_admitted

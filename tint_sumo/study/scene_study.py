@@ -1,0 +1,201 @@
+"""How trait models and policies fare in scenes they were not trained in."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from tint_sumo import traits
+from tint_sumo.config import TraitSettings
+from tint_sumo.dataset.recorder import record
+from tint_sumo.dataset.windows import Windows, joined, load_drivers, load_labels, load_windows, split_by_episode
+from tint_sumo.errors import InputError
+from tint_sumo.files import claim_folder, read_json, write_json, write_text
+from tint_sumo.progress import Report
+from tint_sumo.scenes import SCENES, T_INTERSECTION
+from tint_sumo.study.budgets import TRAIT_BUDGETS
+from tint_sumo.study.pool import THREADS_PER_JOB, Job, run_jobs
+from tint_sumo.study.tables import markdown_table
+from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, fit_line
+from tint_sumo.traits.model import find_trait_method
+from tint_sumo.traits.training import train
+
+SPEED = "desired_speed_mps"
+_RESULTS = "results"
+
+
+@dataclass(frozen=True)
+class SceneStudy:
+    """What is recorded, and which trait models are trained and tested on it."""
+
+    windows: int = 60_000  # of each scene and population
+    methods: tuple[str, ...] = ("vae", "cross_window", "morton", "classifier")
+    settings: TraitSettings = field(default_factory=lambda: replace(TRAIT_BUDGETS["full"], epochs=10))
+    seeds: tuple[int, ...] = (0, 1, 2)
+    noise_m: float = 0.0
+    scenes: tuple[str, ...] = tuple(SCENES)
+    recording_seed: int = 77  # of the first scene; unlike that of any dataset a shipped model was trained on
+
+
+def run_scene_study(study: SceneStudy, out: Path, *, workers: int = 2, progress: bool = True) -> pd.DataFrame:
+    """Run the comparison into ``out``; what an earlier, interrupted call has finished is not repeated.
+
+    Each model is trained on one scene, the T-intersection, or on all. A linear classifier, and a line for the desired
+    speed, are fitted to its latents on the training episodes of the same scenes, and tested in every scene.
+
+    Returns:
+        Columns method, trained_on, seed, scene, accuracy (of the linear classifier), speed_r2 (of the drivers' desired
+        speeds where they have no classes); also in scenes.csv and scenes.md.
+
+    Raises:
+        InputError: ``out`` holds another run, or a stage was refused.
+    """
+    if workers < 1:
+        raise InputError(f"workers must be at least 1, not {workers}")
+    with claim_folder(out, {"kind": "scene study", **asdict(study)}):
+        for number, scene in enumerate(study.scenes):
+            for population in ("traits", "continuous"):
+                record(
+                    _data(out, scene, population),
+                    study.windows,
+                    population=population,
+                    seed=study.recording_seed + number,
+                    scene=scene,
+                    workers=workers,
+                    progress=progress,
+                )
+        run_jobs(plan(study, out), workers, progress)
+        return _report(out)
+
+
+def plan(study: SceneStudy, out: Path) -> list[Job]:
+    """A job for each method, seed, and choice of scenes to train on."""
+    choices = ((T_INTERSECTION,), study.scenes)
+    return [
+        TransferJob(study, method, trained_on, seed, out)
+        for seed in study.seeds
+        for method in study.methods
+        for trained_on in choices
+    ]
+
+
+def _data(out: Path, scene: str, population: str) -> Path:
+    return out / f"{population}-{scene}"
+
+
+@dataclass(frozen=True)
+class TransferJob:
+    """Train one method on some scenes, and test it in all."""
+
+    study: SceneStudy
+    method: str
+    trained_on: tuple[str, ...]
+    seed: int
+    out: Path
+
+    needs = ()
+
+    @property
+    def name(self) -> str:
+        return f"{self.method}-{self._choice}-seed{self.seed}"
+
+    @property
+    def _choice(self) -> str:
+        return self.trained_on[0] if len(self.trained_on) == 1 else "all"
+
+    @property
+    def _result_file(self) -> Path:
+        return self.out / _RESULTS / f"{self.name}.json"
+
+    def is_done(self) -> bool:
+        return self._result_file.exists()
+
+    def run(self, report: Report) -> str:
+        torch.set_num_threads(THREADS_PER_JOB)
+        scenes = self.study.scenes
+        report(0, len(scenes) + 1, "training")
+        model, probe = self._train()
+        line = fit_line(model, *self._properties(self.trained_on, test=False))
+        rows = []
+        for done, scene in enumerate(scenes):
+            report(done + 1, len(scenes) + 1, scene)
+            accuracy = probe.score(*self._labelled((scene,), test=True)).accuracy
+            speed_r2 = float(line(*self._properties((scene,), test=True)))
+            rows.append({"scene": scene, "accuracy": accuracy, "speed_r2": speed_r2})
+        write_json(
+            self._result_file,
+            {"method": self.method, "trained_on": self._choice, "seed": self.seed, "scenes": rows},
+        )
+        return ", ".join(f"{row['scene']} {row['accuracy']:.2%}" for row in rows)
+
+    def _train(self) -> tuple[traits.TraitModel, Probe]:
+        windows, labels = self._labelled(self.trained_on, test=False)
+        model = train(
+            windows,
+            self.study.settings,
+            self.out / "models" / self.name,
+            method=self.method,
+            seed=self.seed,
+            conservative=labels if find_trait_method(self.method).uses_labels else None,
+            progress=False,
+            card={"data": {"scenes": list(self.trained_on), "windows": len(windows)}},
+        )
+        return model, Probe(model, windows, labels, noise_m=self.study.noise_m, seed=self.seed)
+
+    def _labelled(self, scenes: Sequence[str], *, test: bool) -> tuple[Windows, Any]:
+        """Training or test windows of some scenes, and whether their drivers are conservative."""
+        parts, labels = [], []
+        for scene in scenes:
+            data = _data(self.out, scene, "traits")
+            windows, chosen = self._chosen(data, test)
+            parts.append(windows[chosen])
+            labels.append(load_labels(data, windows)[chosen])
+        return joined(parts), np.concatenate(labels)
+
+    def _properties(self, scenes: Sequence[str], *, test: bool) -> tuple[Windows, Any]:
+        """The same for drivers without classes, and their desired speeds."""
+        parts, speeds_mps = [], []
+        for scene in scenes:
+            data = _data(self.out, scene, "continuous")
+            windows, chosen = self._chosen(data, test)
+            parts.append(windows[chosen])
+            speeds_mps.append(load_drivers(data, windows, [SPEED])[SPEED].to_numpy(np.float64)[chosen])
+        return joined(parts), np.concatenate(speeds_mps)
+
+    def _chosen(self, data: Path, test: bool) -> tuple[Windows, Any]:
+        windows = load_windows(data)
+        return windows, split_by_episode(windows, TEST_FRACTION, self.seed)[int(test)]
+
+
+def _report(out: Path) -> pd.DataFrame:
+    found = [read_json(file, "result of the study") for file in sorted((out / _RESULTS).glob("*.json"))]
+    keys = ("method", "trained_on", "seed")
+    table = pd.DataFrame([{key: one[key] for key in keys} | row for one in found for row in one["scenes"]])
+    write_text(out / "scenes.csv", table.to_csv(index=False))
+    write_text(out / "scenes.md", report_markdown(table))
+    return table
+
+
+def report_markdown(table: pd.DataFrame) -> str:
+    """Accuracy and R2 by scene, means and standard deviations over the seeds."""
+    return "\n".join(
+        f"## {title}\n\n{markdown_table(_lines(table.assign(value=scale * table[column])))}\n"
+        for column, title, scale in (
+            ("accuracy", "Accuracy of a linear classifier, %", 100.0),
+            ("speed_r2", "R2 of the desired speed, drivers without classes", 1.0),
+        )
+    )
+
+
+def _lines(table: pd.DataFrame) -> list[list[str]]:
+    """A header, and a line for each model."""
+    scenes = list(dict.fromkeys(table["scene"]))
+    lines = [["method", "trained on", *scenes]]
+    for (method, trained_on), rows in table.groupby(["method", "trained_on"], sort=False):
+        values = [rows.loc[rows["scene"] == scene, "value"].to_numpy() for scene in scenes]
+        lines.append([str(method), str(trained_on), *(f"{one.mean():.2f} ± {one.std(ddof=1):.2f}" for one in values)])
+    return lines

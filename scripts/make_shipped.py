@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 
 from tint_sumo import ENV_IDS
@@ -61,6 +62,14 @@ def make_traits(work: Path) -> None:
     copy(work / "reconstruction.png", DATA / "images" / "reconstruction.png")
 
 
+def make_scenes(work: Path) -> None:
+    """Trait models in scenes they were not trained in."""
+    study = work / "scenes"
+    run("study", "scenes", "--out", str(study))
+    for suffix in (".csv", ".md"):
+        copy(study / f"scenes{suffix}", DATA / "results" / f"scenes{suffix}")
+
+
 def make_policies(work: Path) -> None:
     """The navigation study: its tables and figures, and the policy of each method with the first seed."""
     study = work / "navigation"
@@ -97,14 +106,29 @@ def copy(source: Path, target: Path) -> None:
 
 
 def make_pictures() -> None:
-    env = gymnasium.make(ENV_IDS[T_INTERSECTION], render_mode="rgb_array")
+    """The paper's scene, and all scenes side by side."""
+    pictures = {name: picture_of(name) for name in ENV_IDS}
+    Image.fromarray(pictures[T_INTERSECTION]).save(DATA / "images" / "scene.png", optimize=True)
+    small = [Image.fromarray(one).resize((one.shape[1] // 2, one.shape[0] // 2)) for one in pictures.values()]
+    rows = [small[:3], small[3:]]
+    width, heights = small[0].width + 8, [max(one.height for one in row) + 8 for row in rows]
+    sheet = Image.new("RGB", (3 * width, sum(heights)), "white")
+    for number, row in enumerate(rows):
+        for column, one in enumerate(row):
+            sheet.paste(one, (column * width, sum(heights[:number])))
+    sheet.save(DATA / "images" / "scenes.png", optimize=True)
+
+
+def picture_of(scene: str) -> NDArray[np.uint8]:
+    """A moment of an episode in which the ego moves in."""
+    env = gymnasium.make(ENV_IDS[scene], render_mode="rgb_array")
     env.reset(seed=1)
     for step in range(41):
         env.step(np.int64(2 if step > 5 else 0))
     picture = env.render()
     assert isinstance(picture, np.ndarray)
-    Image.fromarray(picture).save(DATA / "images" / "scene.png", optimize=True)
     env.close()
+    return picture
 
 
 if __name__ == "__main__":
@@ -114,3 +138,4 @@ if __name__ == "__main__":
     make_pictures()
     make_traits(Path(sys.argv[1]))
     make_policies(Path(sys.argv[1]))
+    make_scenes(Path(sys.argv[1]))

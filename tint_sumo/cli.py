@@ -89,10 +89,17 @@ class Record(Command):
     """Processes that simulate; the dataset does not depend on their number."""
     format: Literal["parquet", "fcd"] = "parquet"
     """Parquet is always written; fcd: SUMO's floating-car data, too, also for a dataset that is there already."""
+    sumocfg: Path | None = None
+    """A SUMO configuration of your own in place of a scene: its network and demand, its vTypes as labels."""
 
     def run(self) -> Outcome:
+        from tint_sumo.dataset.own_recorder import record_sumocfg
         from tint_sumo.dataset.recorder import record
 
+        if self.sumocfg is not None:
+            self._require_nothing_but_the_configuration()
+            manifest = record_sumocfg(self.sumocfg, self.out, self.windows, seed=self.seed, workers=self.workers)
+            return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
         manifest = record(
             self.out,
             self.windows,
@@ -104,6 +111,12 @@ class Record(Command):
             fcd=self.format == "fcd",
         )
         return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
+
+    def _require_nothing_but_the_configuration(self) -> None:
+        for flag in ("p_conservative", "population", "scene", "format"):
+            if getattr(self, flag) != getattr(Record, flag):
+                name = flag.replace("_", "-")
+                raise InputError(f"--{name} does not go with --sumocfg, which tells all of the traffic; leave it out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,7 +295,7 @@ class TrainPolicy(Command):
     budget: BudgetName = "full"
     """Sizes of the network, settings of PPO and number of decisions. full takes 5 to 8 minutes on a free core."""
     scene: str = "t_intersection"
-    """Scene: t_intersection, t_intersection_right, four_way, four_way_turn, roundabout or on_ramp."""
+    """Scene: t_intersection, t_intersection_right, four_way, four_way_turn, roundabout, on_ramp, or all."""
     traits: str | None = None
     """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file; the
     shipped one of the method if not given."""
@@ -373,7 +386,7 @@ class RunStudy(Command):
     after_interrupt: ClassVar[str] = RESUMES
 
     budget: BudgetName = "quick"
-    """quick: minutes, few decisions. full: all methods with three seeds, two hours. paper: all numbers as in the paper,
+    """quick: minutes, few decisions. full: all methods, four seeds, three hours. paper: all numbers as in the paper,
     days."""
     out: Path | None = None
     """Folder of the study; runs/<budget> if not given."""

@@ -76,7 +76,7 @@ def test_bad_tasks_are_refused(changes: dict[str, object], message: str, merge: 
 
 
 def test_the_ego_may_not_start_on_a_junction(merge: OwnNetwork) -> None:
-    with pytest.raises(InputError, match="on a junction; its route's edges are at 0.0 to"):
+    with pytest.raises(InputError, match=r"on a junction; its route's edges are at 0\.0 to"):
         merge.scene(start_m=merge.scene().route_edge_start_m[1] - 0.5)
 
 

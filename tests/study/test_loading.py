@@ -12,7 +12,7 @@ from tint_sumo import traits
 from tint_sumo.config import PpoSettings, ends
 from tint_sumo.errors import InputError
 from tint_sumo.policy import EncoderTraits, NoTraits
-from tint_sumo.scenes import T_INTERSECTION
+from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION, digest_of
 from tint_sumo.study import loading
 from tint_sumo.study.budgets import ALL_MIXES
 from tint_sumo.study.evaluation import evaluate
@@ -290,3 +290,27 @@ def test_a_policy_of_every_learned_method_is_shipped(name: str) -> None:
         assert contender.p_conservative == ALL_MIXES
     finally:
         venv.close()
+
+
+def test_a_policy_of_another_version_of_its_scene_is_refused_unless_the_scene_is_named(
+    run: Path, tmp_path: Path
+) -> None:
+    for suffix in (".json", ".safetensors"):
+        shutil.copy(run / f"policy{suffix}", tmp_path / f"policy{suffix}")
+    card = json.loads((tmp_path / "policy.json").read_text())
+    (tmp_path / "policy.json").write_text(json.dumps(card | {"scene_digest": "of another day"}))
+    with pytest.raises(InputError, match="another version of the scene t_intersection; say --scene t_intersection"):
+        load_policy(tmp_path)
+    assert load_policy(tmp_path, scene=T_INTERSECTION).scene == T_INTERSECTION
+
+
+def test_a_policy_of_all_scenes_needs_one_to_drive_in(run: Path, tmp_path: Path) -> None:
+    for suffix in (".json", ".safetensors"):
+        shutil.copy(run / f"policy{suffix}", tmp_path / f"policy{suffix}")
+    card = json.loads((tmp_path / "policy.json").read_text())
+    (tmp_path / "policy.json").write_text(
+        json.dumps(card | {"scene": ALL_SCENES, "scene_digest": digest_of(ALL_SCENES)})
+    )
+    with pytest.raises(InputError, match="was trained in all scenes; say --scene NAME"):
+        load_policy(tmp_path)
+    assert load_policy(tmp_path, scene="on_ramp").scene == "on_ramp"

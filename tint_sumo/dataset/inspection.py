@@ -11,21 +11,23 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from tint_sumo.config import POPULATIONS, DriverProfile
+from tint_sumo.config import POPULATIONS
 from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, read_shard, shard_file
-from tint_sumo.dataset.windows import read_manifest
+from tint_sumo.dataset.windows import own_vtypes, read_manifest
 from tint_sumo.errors import InputError
 from tint_sumo.files import whole_file
 from tint_sumo.progress import make_bar
 
 RESOLUTION = 0.01  # m, m/s or s: values are rounded to multiples of it
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+Colour = tuple[float, float, float]  # red, green and blue, each in [0, 1]
 _KEYS = ["episode", "vehicle"]
 
 
@@ -125,7 +127,7 @@ def inspect(folder: Path, progress: bool = True) -> Inspection:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
     """
     manifest = read_manifest(folder)
-    traits = {profile.name: TraitStatistics() for profile in _profiles(manifest)}
+    traits = {trait: TraitStatistics() for trait in _colours(manifest)}
     episode_s = drivers_per_episode = NOTHING
     for rows in _shards(folder, manifest, progress):
         for trait in traits:
@@ -142,8 +144,13 @@ def inspect(folder: Path, progress: bool = True) -> Inspection:
     return Inspection(manifest, traits, episode_s, drivers_per_episode)
 
 
-def _profiles(manifest: Mapping[str, Any]) -> tuple[DriverProfile, ...]:
-    return POPULATIONS[manifest["population"]].profiles
+def _colours(manifest: Mapping[str, Any]) -> dict[str, Colour]:
+    """Of each trait."""
+    vtypes = own_vtypes(manifest)
+    if vtypes is None:
+        return {profile.name: profile.rgb for profile in POPULATIONS[manifest["population"]].profiles}
+    palette = colormaps["tab10"]
+    return {vtype: palette(number % palette.N)[:3] for number, vtype in enumerate(vtypes)}
 
 
 def _shards(folder: Path, manifest: Mapping[str, Any], progress: bool) -> Iterator[pd.DataFrame]:
@@ -199,12 +206,12 @@ def plot(inspection: Inspection, file: Path) -> None:
     """Write a PNG of the distributions of speed, gap and time on the street, per trait."""
     figure = Figure(figsize=(12.0, 4.2), dpi=150, layout="constrained")
     speed, gap, track = figure.subplots(1, 3)
-    profiles = _profiles(inspection.manifest)
-    for profile in profiles:
-        one = inspection.traits[profile.name]
-        _draw(speed, one.speed_mps, profile, width=0.02)
-        _draw(gap, one.gap_m, profile, width=0.1)
-        _draw(track, one.track_s, profile, width=0.5)
+    colours = _colours(inspection.manifest)
+    for trait, colour in colours.items():
+        one = inspection.traits[trait]
+        _draw(speed, one.speed_mps, colour, width=0.02)
+        _draw(gap, one.gap_m, colour, width=0.1)
+        _draw(track, one.track_s, colour, width=0.5)
     speed.set(xlabel="speed (m/s)", ylabel="steps")
     gap.set(xlabel="gap to the leader, if there is one (m)", xlim=(0, None))
     track.set(xlabel="time on the street (s)", ylabel="drivers", xlim=(0, None))
@@ -215,20 +222,20 @@ def plot(inspection: Inspection, file: Path) -> None:
     episodes = inspection.episode_s.count.sum()
     figure.suptitle(f"{inspection.manifest['windows']:,} windows, {episodes:,} episodes of traffic")
     known = [
-        Patch(color=one.rgb, alpha=0.5, label=f"{one.name} ({inspection.traits[one.name].drivers:,} drivers)")
-        for one in profiles
+        Patch(color=colour, alpha=0.5, label=f"{trait} ({inspection.traits[trait].drivers:,} drivers)")
+        for trait, colour in colours.items()
     ]
     figure.legend(handles=known, loc="outside lower center", ncols=len(known), frameon=False)
     with whole_file(file) as partial:
         figure.savefig(partial, format="png")
 
 
-def _draw(axes: Axes, distribution: Distribution, profile: DriverProfile, width: float) -> None:
+def _draw(axes: Axes, distribution: Distribution, colour: Colour, width: float) -> None:
     """A histogram; its edges lie between the rounded values."""
     if len(distribution.value) == 0:
         return
     first, last = (np.floor(end / width) for end in distribution.value[[0, -1]])
     edges = np.arange(first, last + 2) * width - RESOLUTION / 2
     share, _ = np.histogram(distribution.value, edges, weights=distribution.count / distribution.count.sum())
-    axes.stairs(share, edges, color=profile.rgb, alpha=0.35, fill=True)
-    axes.stairs(share, edges, color=profile.rgb)
+    axes.stairs(share, edges, color=colour, alpha=0.35, fill=True)
+    axes.stairs(share, edges, color=colour)

@@ -3,15 +3,14 @@
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
-from xml.sax import SAXException
 
 import numpy as np
 import pandas as pd
-import sumolib
 from numpy.typing import NDArray
 
 from tint_sumo.config import NO_LEADER_GAP_M
 from tint_sumo.errors import InputError
+from tint_sumo.scenes.own import read_net
 
 
 @dataclass(frozen=True)
@@ -25,12 +24,7 @@ class Lanes:
     @classmethod
     def read(cls, net_file: Path) -> Self:
         """Raises InputError if there is no such file or it is not a SUMO network."""
-        if not net_file.is_file():
-            raise InputError(f"{net_file} is no file; give the scenario's .net.xml")
-        try:
-            net = sumolib.net.readNet(str(net_file), withInternal=True)
-        except (SAXException, ValueError, KeyError, OSError, EOFError) as error:
-            raise InputError(f"{net_file} is not a SUMO network ({error}); give the scenario's .net.xml") from None
+        net = read_net(net_file)
         lanes = [lane for edge in net.getEdges() for lane in edge.getLanes()]
         if not lanes:
             raise InputError(f"{net_file} has no lanes; give the scenario's .net.xml")

@@ -1,6 +1,6 @@
 """Windows of up to 20 steps for learning traits, from a recorded dataset. Labels are loaded apart."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
@@ -92,13 +92,25 @@ def steps_in_window(driver: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray((np.arange(len(driver)) - track_start) % WINDOW_STEPS)
 
 
-def load_labels(folder: Path, windows: Windows) -> NDArray[np.bool_]:
-    """Whether each window's driver is conservative; (N,). Never an input of a method without labels.
+def load_labels(folder: Path, windows: Windows) -> NDArray[Any]:
+    """Whether each window's driver is conservative; (N,) bool. Never an input of a method without labels.
+
+    In a dataset of one's own SUMO configuration: (N,) int64, numbers of the drivers' vTypes in their sorted order.
 
     Raises:
         InputError: the labels are missing or do not belong to these windows.
     """
-    return np.asarray(load_drivers(folder, windows, ["trait"])["trait"] == "conservative", bool)
+    trait = load_drivers(folder, windows, ["trait"])["trait"].astype(str)
+    vtypes = own_vtypes(read_manifest(folder))
+    if vtypes is None:
+        return np.asarray(trait == "conservative", bool)
+    return pd.Index(vtypes).get_indexer(pd.Index(trait)).astype(np.int64)
+
+
+def own_vtypes(manifest: Mapping[str, Any]) -> list[str] | None:
+    """The vTypes of a dataset of one's own SUMO configuration; None for a built-in population."""
+    population = manifest["population"]
+    return population if isinstance(population, list) else None
 
 
 def load_drivers(folder: Path, windows: Windows, columns: Sequence[str]) -> pd.DataFrame:

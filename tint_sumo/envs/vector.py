@@ -17,6 +17,8 @@ from tint_sumo.envs.workers import WorkerBatch
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
 
+AnyScene = str | Scene | OwnScene
+
 
 class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     """``num_envs`` times :class:`~tint_sumo.envs.scene_env.SceneEnv`, whose docstring is the manual.
@@ -25,6 +27,9 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     seed, whatever ``num_envs`` is. A finished episode is followed by the next one in the same step
     (``AutoresetMode.SAME_STEP``): its last observation and info stand in ``infos["final_obs"]`` and
     ``infos["final_info"]``. All other infos are arrays over the environments.
+
+    ``scene`` may also be a list of scenes: the environments are shared out among them, in order and as evenly as can
+    be, and each scene has a process of its own.
 
     With ``workers`` above 1 the environments are shared out among as many processes, with the same results; a script
     that asks for them needs the usual ``if __name__ == "__main__":``. This process is one of them, unless another
@@ -41,17 +46,24 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def __init__(
         self,
         num_envs: int = 1,
-        scene: str | Scene | OwnScene = T_INTERSECTION,
+        scene: AnyScene | Sequence[AnyScene] = T_INTERSECTION,
         render_mode: str | None = None,
-        workers: int = 1,
+        workers: int | None = None,
         **task: Any,
     ) -> None:
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, not {num_envs}")
-        if not 1 <= workers <= num_envs:
-            raise InputError(f"workers must be 1 to num_envs = {num_envs}, not {workers}")
+        alike: list[AnyScene] = [scene] if isinstance(scene, str | Scene | OwnScene) else []
+        scenes = alike * (1 if workers is None else workers) if alike else list(scene)  # type: ignore[arg-type]
+        if not 1 <= len(scenes) <= num_envs:
+            raise InputError(f"workers must be 1 to num_envs = {num_envs}, not {len(scenes)}")
+        if not alike and workers not in (None, len(scenes)):
+            raise InputError(f"{len(scenes)} scenes need as many workers, not {workers}; leave workers out")
         require_render_mode(render_mode)
-        settings = TaskSettings(scene, **task)
+        all_settings = [TaskSettings(one, **task) for one in scenes]
+        settings = all_settings[0]
+        if len({one.played.max_vehicles for one in all_settings}) > 1:
+            raise InputError("scenes of one environment must observe the same number of vehicles; change max_vehicles")
         self.num_envs = num_envs
         self.slot_infos = settings.slot_infos
         self.render_mode = render_mode
@@ -59,7 +71,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self.single_action_space: spaces.Discrete = action_space(settings.played)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.batch: Batch = LocalBatch(num_envs, settings) if workers == 1 else WorkerBatch(num_envs, settings, workers)
+        self.batch: Batch = LocalBatch(num_envs, settings) if len(scenes) == 1 else WorkerBatch(num_envs, all_settings)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

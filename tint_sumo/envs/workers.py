@@ -32,27 +32,28 @@ _INTEGER = np.dtype(np.int64)
 
 
 class WorkerBatch:
-    """``num_envs`` environments shared out among ``workers`` processes, in order and as evenly as can be.
+    """``num_envs`` environments shared out among processes, in order and as evenly as can be; each has its settings.
 
     The first of them is this process, which would have nothing else to do while the others step; unless it already runs
     a simulation of its own, since libsumo holds one per process. An error in one of them, its death, or an interruption
     ends all the others.
     """
 
-    def __init__(self, num_envs: int, settings: TaskSettings, workers: int) -> None:
-        shared = _Shared(num_envs, workers, settings.played.max_vehicles)
+    def __init__(self, num_envs: int, settings: Sequence[TaskSettings]) -> None:
+        workers = len(settings)
+        shared = _Shared(num_envs, workers, settings[0].played.max_vehicles)
         bounds = [num_envs * worker // workers for worker in range(workers + 1)]
         self._shares = [slice(*share) for share in pairwise(bounds)]
         self.rows = shared.rows
         self._local: LocalBatch | None = None
         self._helpers: list[_Helper] = []
         self._finalizer = weakref.finalize(self, _end, self._helpers)
-        takes_part = settings.backend == "traci" or libsumo_is_free()
+        takes_part = settings[0].backend == "traci" or libsumo_is_free()
         try:
             for worker in range(int(takes_part), workers):
-                self._helpers.append(_start(worker, shared, self._shares[worker], settings))
+                self._helpers.append(_start(worker, shared, self._shares[worker], settings[worker]))
             if takes_part:
-                self._local = LocalBatch(self._shares[0].stop, settings, self.rows[self._shares[0]])
+                self._local = LocalBatch(self._shares[0].stop, settings[0], self.rows[self._shares[0]])
             self._listen()
         except BaseException:
             self.close()

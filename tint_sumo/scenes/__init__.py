@@ -5,6 +5,28 @@ from tint_sumo.scenes import on_ramp as on_ramp
 from tint_sumo.scenes import roundabout as roundabout
 from tint_sumo.scenes import t_intersection as t_intersection
 from tint_sumo.scenes.own import OwnScene, from_sumocfg
-from tint_sumo.scenes.scene import SCENES, T_INTERSECTION, EgoTask, Route, Scene, View, find_scene
+from tint_sumo.scenes.scene import (
+    ALL_SCENES,
+    SCENES,
+    T_INTERSECTION,
+    EgoTask,
+    Route,
+    Scene,
+    View,
+    digest_of,
+    find_scene,
+)
 
-__all__ = ["SCENES", "T_INTERSECTION", "EgoTask", "OwnScene", "Route", "Scene", "View", "find_scene", "from_sumocfg"]
+__all__ = [
+    "ALL_SCENES",
+    "SCENES",
+    "T_INTERSECTION",
+    "EgoTask",
+    "OwnScene",
+    "Route",
+    "Scene",
+    "View",
+    "digest_of",
+    "find_scene",
+    "from_sumocfg",
+]

@@ -5,7 +5,7 @@ from tint_sumo.scenes.network import Connection, Edge, Network, Node, Point
 from tint_sumo.scenes.parts import AHEAD_ONLY, OVERHANG_M
 from tint_sumo.scenes.scene import EgoTask, Route, Scene, View, register
 
-_END_M = 30.0 + OVERHANG_M
+_END_M = 20.0 + OVERHANG_M
 _TAPER_START_M, _TAPER_END_M, _RAMP_Y_M = -8.0, 10.0, -4.0
 _TAPER_POINTS = 25
 _HALF_LANE_M = 2.0
@@ -45,7 +45,7 @@ def on_ramp() -> Scene:
         title="merge from an acceleration lane (right-hand traffic)",
         network=_network(),
         routes=(Route("main", ("main_in", "main_out")),),
-        ego=EgoTask(edges=("ramp", "main_out"), start_m=24.0, goal_m=50.0, controller=AHEAD_ONLY),
-        view=View(-33.0, -12.0, 33.0, 8.0),
+        ego=EgoTask(edges=("ramp", "main_out"), start_m=14.0, goal_m=40.0, controller=AHEAD_ONLY),
+        view=View(-23.0, -10.0, 23.0, 6.0),
         claim=Claim(by="box"),
     )

@@ -42,6 +42,10 @@ class SumoConfig:
     outputs: tuple[str, ...]  # options that would write files
 
     @property
+    def name(self) -> str:
+        return self.file.name.removesuffix(".sumocfg")
+
+    @property
     def files(self) -> tuple[Path, ...]:
         """All that the simulation follows from."""
         return (self.file, self.net_file, *self.demand_files)
@@ -136,7 +140,7 @@ def from_sumocfg(
     if max_vehicles < 1:
         raise InputError(f"max_vehicles must be at least 1, not {max_vehicles}")
     return OwnScene(
-        name=config.file.name.removesuffix(".sumocfg"),
+        name=config.name,
         config=config,
         vtypes=read_vtypes(config),
         ego_route=tuple(ego_route),

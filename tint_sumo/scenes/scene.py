@@ -78,6 +78,8 @@ class Scene:
 
 T_INTERSECTION = "t_intersection"  # the paper's scene
 
+ALL_SCENES = "all"  # of a policy that was trained in every scene at once
+
 SCENES: dict[str, Callable[[], Scene]] = {}
 
 
@@ -102,3 +104,14 @@ def find_scene(name: str) -> Scene:
     if name not in SCENES:
         raise InputError(f"unknown scene {name!r}; choose one of: {', '.join(SCENES)}")
     return SCENES[name]()
+
+
+def digest_of(name: str) -> str:
+    """The digest of a scene, or of all scenes together.
+
+    Raises:
+        InputError: there is no such scene.
+    """
+    if name != ALL_SCENES:
+        return find_scene(name).digest
+    return hashlib.sha256("".join(make().digest for make in SCENES.values()).encode()).hexdigest()[:16]

@@ -6,7 +6,7 @@ around the ego are asked for with a context subscription, at the same cost howev
 
 import math
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -79,7 +79,7 @@ class Kinds:
         )
 
 
-def sumo_options(config: SumoConfig, seed: int, step_s: float | None = None) -> list[str]:
+def sumo_options(config: SumoConfig, seed: int | Sequence[int], step_s: float | None = None) -> list[str]:
     """Command-line options that run a configuration with this seed, and let it write none of the files it asks for."""
     draws = np.random.SeedSequence(seed).generate_state(1)
     return [
@@ -316,7 +316,7 @@ class OwnSimulation:
         """Advance by one step; (1,) desired speed of the ego.
 
         Raises:
-            InputError: SUMO finds fault with the demand, or has taken the ego off the road.
+            InputError: SUMO finds fault with the demand, or teleports the ego.
         """
         if not self._drives:
             return
@@ -327,10 +327,12 @@ class OwnSimulation:
 
     def _look(self) -> None:
         """See where everybody is."""
+        self._require_ego_on_road()
         seen = dict(self.connection.vehicle.getContextSubscriptionResults(EGO))
         own = seen.pop(EGO, None)
         if own is None:
-            self._end_drive()
+            self._drives = False
+            self.egos.arrive()
             return
         self.egos.follow(own, self.origin_m)
         front_m = own[constants.VAR_POSITION]
@@ -341,14 +343,14 @@ class OwnSimulation:
         if hit_slot != EMPTY:
             self.egos.collision[0] = self._collision(hit_slot)
 
-    def _end_drive(self) -> None:
-        self._drives = False
-        if EGO not in self.connection.simulation.getArrivedIDList():
+    def _require_ego_on_road(self) -> None:
+        """SUMO puts vehicles that have waited for long elsewhere: whoever stands still would get ahead."""
+        simulation = self.connection.simulation
+        if EGO in simulation.getStartingTeleportIDList():
             raise InputError(
-                f"SUMO has taken the ego off the road at {self.connection.simulation.getTime():g} s, where nothing "
-                'moved any more; set time-to-teleport to "-1" in the configuration'
+                f"SUMO teleports the ego at {simulation.getTime():g} s, because it has waited for long; set "
+                f'time-to-teleport to "-1" in {self.scene.config.file}, or to more than the episodes take'
             )
-        self.egos.arrive()
 
     def _collision(self, slot: int) -> Collision:
         vehicle_id = next(one for one, its in self.slots.slot.items() if its == slot)

@@ -122,7 +122,7 @@ BUDGETS = {
         traits=None,
         ppo=_FULL_PPO,
         methods=("always_go", "ttc", *_TRAINED),
-        seeds=(0, 1, 2),
+        seeds=(0, 1, 2, 3),
         trials=(
             Trials(tuple(Conditions(p) for p in (0.1, 0.25, 0.4, 0.6, 0.9)), 1000),
             Trials(

@@ -15,7 +15,7 @@ from tint_sumo.files import shipped
 from tint_sumo.policy import RecurrentPPO, TraitSource
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
 from tint_sumo.policy.venv import policy_venv
-from tint_sumo.scenes import SCENES, T_INTERSECTION, find_scene
+from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, digest_of, find_scene
 from tint_sumo.study.methods import METHODS, Learned, Policy, Rule, find_learned
 from tint_sumo.study.training import POLICY, TRAITS, digest
 from tint_sumo.traits import TraitModel
@@ -59,21 +59,37 @@ def load_policy(name_or_path: str | Path, *, scene: str | None = None, allow_pic
         place = find_scene(scene or T_INTERSECTION).name
         return Contender(method.name, method.make(place), scene=place)
     if Path(name_or_path).suffix == ".zip":
-        found = _load_zip(Path(name_or_path), allow_pickle)
+        stem = Path(name_or_path).with_suffix("")
+        found = _contender(stem, _load_zip(Path(name_or_path), allow_pickle))
     else:
         stem = find_policy(name_or_path)
-        found = replace(_contender(stem, load_policy_network(stem)), name=str(name_or_path))
-    return found if scene is None else replace(found, scene=find_scene(scene).name)
+        found = _contender(stem, load_policy_network(stem))
+    found = replace(found, name=str(name_or_path))
+    if scene is None:
+        if found.scene == ALL_SCENES:
+            raise InputError(f"{name_or_path} was trained in all scenes; say --scene NAME to choose one")
+        _require_same_roads(stem, found.scene)
+        return found
+    return replace(found, scene=find_scene(scene).name)
 
 
-def _load_zip(file: Path, allow_pickle: bool) -> Contender:
+def _require_same_roads(stem: Path, scene: str) -> None:
+    """Raise InputError if a policy was trained in another version of its scene."""
+    if read_policy_card(stem).get("scene_digest") != digest_of(scene):
+        raise InputError(
+            f"{card_file(stem)}: this policy was trained in another version of the scene {scene}; "
+            f"say --scene {scene} to use it all the same"
+        )
+
+
+def _load_zip(file: Path, allow_pickle: bool) -> RecurrentPPO:
     if not allow_pickle:
         raise InputError(
             f"{file} is a pickle, which can run any code when it is read; give the .safetensors file beside it, "
             "or --allow-pickle if you trust the file"
         )
     print(f"reading {file}, a pickle: it can run any code", file=sys.stderr)
-    return replace(_contender(file.with_suffix(""), RecurrentPPO.load(file)), name=str(file))
+    return RecurrentPPO.load(file)
 
 
 def _contender(stem: Path, policy: Any) -> Contender:
@@ -133,7 +149,7 @@ def _checked_card(stem: Path) -> dict[str, Any]:
     settings = card.get("settings")
     fits = isinstance(method, Learned) and is_share(card.get("p_conservative"))
     fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
-    fits &= str(card.get("scene")) in SCENES
+    fits &= str(card.get("scene")) in (*SCENES, ALL_SCENES)
     if not fits or (isinstance(method, Learned) and method.encoder and not _is_file_name(card.get("traits"))):
         raise InputError(f"{card_file(stem)} is not the card of a policy; restore the file or train the policy again")
     return card

@@ -109,7 +109,7 @@ _OUTCOME_NOTE = (
     "cases alone (Wilson) where there is one. Time: mean of the successful cases. Paper: published success / timeout / "
     "collision of 500 episodes."
 )
-_COLLISION_NOTE = "Collisions in 1,000 cases by trait and lane of the driver that was hit, over all seeds and mixes."
+_COLLISION_NOTE = "Collisions in 1,000 cases by trait and route of the driver that was hit, over all seeds and mixes."
 _DIFFERENCE_NOTE = (
     "Difference to another method's success on the same cases, in percentage points with 95 % intervals over seeds and "
     "cases (bootstrap)."

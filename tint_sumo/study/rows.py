@@ -66,7 +66,7 @@ class Row:
 
     @property
     def collisions(self) -> dict[str, int]:
-        """Number of collisions by trait and lane of the driver that was hit, over all seeds."""
+        """Number of collisions by trait and route of the driver that was hit, over all seeds."""
         return self._pooled.collisions
 
     @property

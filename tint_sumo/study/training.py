@@ -28,7 +28,7 @@ from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy
 from tint_sumo.policy.venv import policy_venv
 from tint_sumo.progress import Report, silent
-from tint_sumo.scenes import T_INTERSECTION, find_scene
+from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, digest_of
 from tint_sumo.study.evaluation import CASE_SEED, require_seed
 from tint_sumo.study.methods import Learned, find_learned
 from tint_sumo.traits import TraitModel
@@ -75,7 +75,7 @@ def train_policy(
         seed: of weights, actions and environments, 0 to 1000.
         out: a new folder, or the one of this very run.
         settings: network and PPO; its ``total_steps`` is not used.
-        scene: name of the scene it trains in.
+        scene: name of the scene it trains in, or ``"all"``.
         traits: trait model by name or path, for methods that infer traits; the shipped one if not given.
         with_zip: write the policy as Stable-Baselines3's policy.zip, too.
         report: told of the progress.
@@ -100,7 +100,7 @@ def train_policy(
         "steps": steps,
         "seed": seed,
         "scene": scene,
-        "scene_digest": find_scene(scene).digest,
+        "scene_digest": digest_of(scene),
         "settings": asdict(settings),
         "traits": None if encoder is None else digest(encoder),
     }
@@ -169,7 +169,7 @@ def training_venv(
         action_repeat=settings.action_repeat,
         critic_sees_true_traits=learned.critic_sees_true_traits,
         monitored=True,
-        scene=scene,
+        scene=list(SCENES) if scene == ALL_SCENES else scene,
         p_conservative=p_conservative,
         time_limit_s=settings.time_limit_s,
     )

@@ -1,0 +1,116 @@
+"""What holds for the environment of every scene."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from tint_sumo import ENV_IDS, SCENE_ENV_ID
+from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.errors import InputError
+from tint_sumo.scenes import SCENES, find_scene
+
+GO = np.int64(2)
+scenes = pytest.mark.parametrize("name", SCENES)
+
+
+@scenes
+@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # of the checker, about rendering without a mode
+def test_gymnasium_finds_nothing_wrong(name: str) -> None:
+    env = gymnasium.make(ENV_IDS[name], time_limit_s=2.0)
+    try:
+        check_env(env.unwrapped, skip_render_check=True)
+    finally:
+        env.close()
+
+
+@scenes
+def test_an_ego_on_empty_roads_reaches_its_goal(name: str) -> None:
+    env = SceneEnv(name)
+    try:
+        env.reset(seed=0)
+        simulation = env._episodes.simulation
+        simulation.reset_to(0, [])  # nobody else is there
+        for _ in range(300):
+            _, reward, terminated, truncated, info = env.step(GO)
+            if terminated or truncated:
+                break
+        assert info["outcome"] == "success"
+        assert reward == 2.5
+    finally:
+        env.close()
+
+
+@scenes
+def test_episodes_end_in_all_ways_and_what_is_observed_stays_in_bounds(name: str) -> None:
+    env = SceneVectorEnv(24, name, p_conservative=0.5, time_limit_s=20.0)
+    outcomes: set[str] = set()
+    try:
+        observation, _ = env.reset(seed=0)
+        for step in range(400):
+            actions = np.where(np.arange(24) < 16, 2, 0) if step % 3 else np.full(24, 1)
+            observation, _, terminated, truncated, infos = env.step(actions)
+            if (terminated | truncated).any():
+                outcomes |= set(infos["final_info"]["outcome"][terminated | truncated].tolist())
+            assert env.observation_space.contains(observation)
+            # Whoever is near is seen where it is, not at the bounds of the space.
+            seen = observation["mask"] > 0.5
+            assert (np.abs(observation["vehicles"][seen]) < 2.0).all(axis=1).mean() > 0.95
+    finally:
+        env.close()
+    assert outcomes == {"success", "collision", "timeout"}
+
+
+@scenes
+def test_a_picture_shows_road_ego_and_drivers(name: str) -> None:
+    env = SceneEnv(name, render_mode="rgb_array", p_conservative=0.5)
+    try:
+        env.reset(seed=1)
+        picture = env.render()
+        assert picture is not None and picture.dtype == np.uint8
+        view = find_scene(name).view
+        height, width, _ = picture.shape
+        assert height / width == pytest.approx((view.top_m - view.bottom_m) / (view.right_m - view.left_m), rel=0.01)
+        for colour in ((240, 180, 0), (40, 90, 200), (200, 40, 40), (143, 149, 155)):
+            assert (np.abs(picture.astype(int) - colour).max(axis=-1) < 10).sum() > 200
+    finally:
+        env.close()
+
+
+def test_any_scene_has_an_environment_without_a_name_of_its_own() -> None:
+    env = gymnasium.make(SCENE_ENV_ID, scene=find_scene("on_ramp"), time_limit_s=1.0)
+    named = gymnasium.make(ENV_IDS["on_ramp"], time_limit_s=1.0, backend="traci")
+    try:
+        first, _ = env.reset(seed=3)
+        second, _ = named.reset(seed=3)
+        for key in first:
+            np.testing.assert_array_equal(first[key], second[key])
+    finally:
+        env.close()
+        named.close()
+
+
+def test_environments_of_several_scenes_are_those_of_each_scene() -> None:
+    """Two scenes share an environment, each in a process of its own."""
+    names = ["four_way", "roundabout"]
+    both = SceneVectorEnv(4, names)
+    try:
+        mixed = [both.reset(seed=5)[0], *(both.step(np.full(4, 2))[0] for _ in range(60))]
+    finally:
+        both.close()
+    for number, name in enumerate(names):
+        alone = SceneVectorEnv(2, name)
+        try:
+            single = [alone.reset(seed=5 + 2 * number)[0], *(alone.step(np.full(2, 2))[0] for _ in range(60))]
+        finally:
+            alone.close()
+        for one, other in zip(mixed, single, strict=True):
+            for key in one:
+                np.testing.assert_array_equal(one[key][2 * number : 2 * number + 2], other[key])
+
+
+def test_several_scenes_need_as_many_workers() -> None:
+    with pytest.raises(InputError, match="2 scenes need as many workers, not 3; leave workers out"):
+        SceneVectorEnv(6, ["four_way", "roundabout"], workers=3)
+    with pytest.raises(InputError, match="workers must be 1 to num_envs = 1, not 2"):
+        SceneVectorEnv(1, ["four_way", "roundabout"])

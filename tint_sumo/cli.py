@@ -8,8 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, Positional, Suppress, subcommand
+from tyro.conf import (
+    FlagCreatePairsOff,
+    OmitArgPrefixes,
+    OmitSubcommandPrefixes,
+    Positional,
+    Suppress,
+    arg,
+    subcommand,
+)
 
+from tint_sumo import ENV_IDS
 from tint_sumo.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,6 +31,8 @@ if TYPE_CHECKING:
 BudgetName = Literal["quick", "full", "paper"]
 ShareFlag = tuple[float, ...]  # one probability, or the two ends of a range
 PopulationName = Literal["traits", "continuous"]
+_SCENES = ", ".join(ENV_IDS)
+SceneName = Annotated[str, arg(help=f"Scene: {_SCENES}.")]
 TraitBudgetName = Literal["quick", "full", "paper"]
 
 _MADE = ("dataset", "traits/*/latent.png", "policies/*/policy.safetensors")  # in a study's folder
@@ -51,8 +62,7 @@ class Command:
 class Net(Command):
     """Build a scene's road network, the drivers and plain SUMO's configuration with netconvert."""
 
-    scene: str = "t_intersection"
-    """Scene: t_intersection, t_intersection_right, four_way, four_way_turn, roundabout or on_ramp."""
+    scene: SceneName = "t_intersection"
     replicas: int = 1
     """Number of intersections in the network."""
     out: Path = Path("sumo_net")
@@ -83,8 +93,7 @@ class Record(Command):
     """traits: conservative and aggressive drivers; continuous: desired speeds and gaps without classes."""
     seed: int = 0
     """Seed of the traffic."""
-    scene: str = "t_intersection"
-    """Scene: t_intersection, t_intersection_right, four_way, four_way_turn, roundabout or on_ramp."""
+    scene: SceneName = "t_intersection"
     workers: int = 1
     """Processes that simulate; the dataset does not depend on their number."""
     format: Literal["parquet", "fcd"] = "parquet"
@@ -294,8 +303,7 @@ class TrainPolicy(Command):
     """Seed of the training, 0 to 1000."""
     budget: BudgetName = "full"
     """Sizes of the network, settings of PPO and number of decisions. full takes 5 to 8 minutes on a free core."""
-    scene: str = "t_intersection"
-    """Scene: t_intersection, t_intersection_right, four_way, four_way_turn, roundabout, on_ramp, or all."""
+    scene: Annotated[str, arg(help=f"Scene: {_SCENES}, or all of them at once: all.")] = "t_intersection"
     traits: str | None = None
     """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file; the
     shipped one of the method if not given."""

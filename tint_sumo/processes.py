@@ -1,11 +1,16 @@
-"""Worker processes that never outlive the main process."""
+"""Worker processes that never outlive the main process, and how they tell what became of their work."""
 
 import os
 import signal
 import threading
+import traceback
 from collections.abc import Callable
 from multiprocessing import connection, get_context, parent_process
-from typing import Any
+from typing import Any, Literal
+
+from tint_sumo.errors import InputError
+
+Told = tuple[Literal["done", "refused", "failed"], Any]
 
 SPAWN = get_context("spawn")  # a forked child would share a running libsumo
 
@@ -31,6 +36,32 @@ def start_worker(
 def _work(target: Callable[..., None], pipe: connection.Connection, *arguments: Any) -> None:
     end_with_parent()
     target(pipe, *arguments)
+
+
+def told(work: Callable[[], Any]) -> Told:
+    """Do some work in a worker; what to send of it."""
+    try:
+        return "done", work()
+    except InputError as error:
+        return "refused", str(error)
+    except (EOFError, ConnectionError):  # nobody is at the other end any more
+        raise
+    except Exception:
+        return "failed", traceback.format_exc()
+
+
+def answer(message: Told, worker: str) -> Any:
+    """What a worker's work gave.
+
+    Raises:
+        InputError, RuntimeError: it was refused, or it failed.
+    """
+    kind, content = message
+    if kind == "refused":
+        raise InputError(content)
+    if kind == "failed":
+        raise RuntimeError(f"{worker} failed:\n{content}")
+    return content
 
 
 def end_with_parent() -> None:

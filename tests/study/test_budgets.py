@@ -50,9 +50,9 @@ def test_the_paper_s_budget_is_the_paper_s() -> None:
     ]
 
 
-def test_the_full_budget_compares_all_methods_with_three_seeds_in_other_worlds_too() -> None:
+def test_the_full_budget_compares_all_methods_with_four_seeds_in_other_worlds_too() -> None:
     full = BUDGETS["full"]
-    assert len(full.seeds) == 3 and full.mixes == (ALL_MIXES,)
+    assert len(full.seeds) == 4 and full.mixes == (ALL_MIXES,)
     trained = [method for method in map(find_method, full.methods) if isinstance(method, Learned)]
     assert {method.encoder for method in trained} - {None} == set(traits.TRAIT_METHODS)
     conditions = {one for trials in full.trials for one in trials.conditions}

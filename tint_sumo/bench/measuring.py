@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from tint_sumo.processes import start_worker
+from tint_sumo.processes import answer, start_worker, told
 
 Turn = Callable[[], float]  # measures once more and returns what it found
 
@@ -67,7 +67,7 @@ def turns_apart(make: Callable[..., AbstractContextManager[Turn]], *arguments: A
 
     def turn() -> float:
         pipe.send("turn")
-        return float(pipe.recv())
+        return float(answer(pipe.recv(), "the process that measures"))
 
     try:
         yield turn
@@ -79,4 +79,4 @@ def turns_apart(make: Callable[..., AbstractContextManager[Turn]], *arguments: A
 def _serve_turns(pipe: Connection, make: Callable[..., AbstractContextManager[Turn]], *arguments: Any) -> None:
     with make(*arguments) as turn, suppress(EOFError, ConnectionError):  # nobody is at the other end
         while pipe.recv():
-            pipe.send(turn())
+            pipe.send(told(turn))

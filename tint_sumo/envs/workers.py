@@ -7,7 +7,6 @@ tell of episodes that ended.
 import os
 import pickle
 import time
-import traceback
 import weakref
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -22,8 +21,7 @@ from numpy.typing import NDArray
 from tint_sumo.envs.batch import Ended, LocalBatch
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import Rows, row_type
-from tint_sumo.errors import InputError
-from tint_sumo.processes import SPAWN, start_worker
+from tint_sumo.processes import SPAWN, answer, start_worker, told
 from tint_sumo.simulation.connection import libsumo_is_free
 
 _ENDING_S = 10.0  # more than enough for a step, and to close a simulation
@@ -110,17 +108,13 @@ class _Helper:
 
     def answer(self) -> Any:
         try:
-            kind, content = self.line.receive()
+            message = self.line.receive()
         except (EOFError, ConnectionError):
             self.process.join(_ENDING_S)
             raise RuntimeError(
                 f"environment worker {self.worker} died with exit code {self.process.exitcode}; make a new environment"
             ) from None
-        if kind == "refused":
-            raise InputError(content)
-        if kind == "failed":
-            raise RuntimeError(f"environment worker {self.worker} failed:\n{content}")
-        return content
+        return answer(message, f"environment worker {self.worker}")
 
 
 def _start(worker: int, shared: "_Shared", share: slice, settings: TaskSettings) -> _Helper:
@@ -191,20 +185,14 @@ def _serve(pipe: Connection, shared: _Shared, worker: int, share: slice, setting
     """A worker process."""
     line = _Line(pipe, shared.sent[worker, ::-1])
     with suppress(EOFError, ConnectionError):  # nobody is at the other end any more
-        try:
-            _answer_requests(line, shared, share, settings)
-        except InputError as error:
-            line.send(("refused", str(error)))
-        except (EOFError, ConnectionError):
-            raise
-        except Exception:
-            line.send(("failed", traceback.format_exc()))
+        line.send(told(lambda: _answer_requests(line, shared, share, settings)))
 
 
 def _answer_requests(line: _Line, shared: _Shared, share: slice, settings: TaskSettings) -> None:
+    """Serve until the other end is gone, or a request goes wrong."""
     batch = LocalBatch(share.stop - share.start, settings, shared.rows[share])
     try:
-        line.send(("ready", None))
+        line.send(("done", None))
         while True:
             request, *arguments = line.receive()
             line.send(("done", getattr(batch, request)(*arguments)))

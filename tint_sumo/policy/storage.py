@@ -104,6 +104,6 @@ def _build(network: Mapping[str, Any]) -> GruPolicy:
     slots = network["max_vehicles"]
     parts = {**observation_space(slots).spaces, TRAITS: trait_space(slots, network["trait_size"])}
     if network["critic_sees_true_traits"]:
-        parts[TRUE_TRAITS] = trait_space(slots, OracleTraits.size)
+        parts[TRUE_TRAITS] = trait_space(slots, OracleTraits().size)
     actions = spaces.Discrete(network["actions"])
     return GruPolicy(spaces.Dict(parts), actions, lambda _: 0.0, settings=PolicySettings(**settings))

@@ -62,7 +62,14 @@ class NoTraits(TraitSource):
 
 
 class OracleTraits(TraitSource):
-    """The true traits, known at once: 1 at the number of the driver's profile, conservative first; else 0."""
+    """The true traits, known at once: 1 at the number of the driver's profile, conservative first; else 0.
+
+    Args:
+        profiles: how many there are in the scene's population.
+    """
+
+    def __init__(self, profiles: int = 2) -> None:
+        self.size = profiles
 
     def begin(self, frame: Frame) -> None:
         self.traits[frame.done] = one_hot(frame.slots["traits"][frame.done], self.size)

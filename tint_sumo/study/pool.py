@@ -2,8 +2,8 @@
 
 import signal
 import sys
-import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from types import FrameType
@@ -12,7 +12,7 @@ from typing import Any, NoReturn, Protocol
 from tqdm import tqdm
 
 from tint_sumo.errors import InputError
-from tint_sumo.processes import start_worker
+from tint_sumo.processes import answer, start_worker, told
 from tint_sumo.progress import Report, make_bar
 
 REFRESH_S = 1.0
@@ -111,11 +111,11 @@ class _Worker:
             return None
         self.bar.close()
         self._process.join()
-        if kind == "refused":
-            raise InputError(f"{self.job.name}: {content}")
         if kind == "died":
             raise RuntimeError(f"{self.job.name} ended with exit code {self._process.exitcode}")
-        return str(content)
+        if kind == "refused":
+            raise InputError(f"{self.job.name}: {content}")
+        return str(answer((kind, content), self.job.name))
 
     def interrupt(self) -> None:
         """Tell the process to save its work and end."""
@@ -135,16 +135,8 @@ def _work(pipe: Connection, job: Job) -> None:
     def report(*content: Any) -> None:
         pipe.send(("progress", content))
 
-    try:
-        message = ("finished", job.run(report))
-    except InputError as error:
-        message = ("refused", str(error))
-    except KeyboardInterrupt:
-        return
-    except Exception:
-        traceback.print_exc()
-        sys.exit(1)
-    pipe.send(message)
+    with suppress(KeyboardInterrupt):
+        pipe.send(told(lambda: job.run(report)))
 
 
 def _raise_interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import pytest
 
+from tint_sumo import ENV_IDS
 from tint_sumo.bench import Sizes, run_benchmark
 from tint_sumo.bench.measuring import Clocks
 from tint_sumo.bench.policies import training_speed
+from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.study.budgets import BUDGETS
 from tint_sumo.traits import TRAIT_METHODS
 
@@ -46,6 +48,7 @@ def test_the_benchmark_measures_everything() -> None:
         "memory_growth_mib",
         "train_windows_per_s",
         "encode_ms",
+        "scenes_to_t_intersection",
         "train_decisions_per_s",
         "recurrent_ppo_decisions_per_s",
         "train_to_recurrent_ppo",
@@ -64,6 +67,8 @@ def test_the_benchmark_measures_everything() -> None:
     for part in ("train_windows_per_s", "encode_ms"):
         assert printed[part].keys() == TRAIT_METHODS.keys()
         assert min(printed[part].values()) > 0.0
+    assert printed["scenes_to_t_intersection"].keys() == ENV_IDS.keys() - {T_INTERSECTION}
+    assert min(printed["scenes_to_t_intersection"].values()) > 0.0
     assert printed["windows"] >= 20
     assert printed["peak_rss_mib"] > 50.0  # three Pythons
     table = found.table()

@@ -78,7 +78,7 @@ def test_changing_every_label_leaves_the_inputs_as_they_are(dataset: Path, tmp_p
     before, after = load_windows(dataset), load_windows(turned)
     for field in ("states", "length", "driver", "episode", "has_leader"):
         np.testing.assert_array_equal(getattr(before, field), getattr(after, field))
-    assert (load_labels(dataset, before) == ~load_labels(turned, after)).all()
+    assert (load_labels(dataset, before) == 1 - load_labels(turned, after)).all()
     shutil.rmtree(turned / DRIVERS)
     np.testing.assert_array_equal(load_windows(turned).states, before.states)
 

@@ -107,6 +107,7 @@ class Benchmark:
     env_to_floor: float
     checking_floor_env_steps_per_s: float
     env_to_checking_floor: float
+    scenes_to_t_intersection: dict[str, float]  # speed of other scenes' environments to the T-intersection's
     gym_env_steps_per_s: float
     cores: tuple[Cores, ...]
     record_windows_per_s: float
@@ -132,6 +133,7 @@ class Benchmark:
             ("Stable-Baselines3 environment", f"{self.env_steps_per_s:,.0f} environment steps/s"),
             ("  its speed to SUMO's alone", f"{self.env_to_floor:.2f}"),
             ("  and with its collision check", f"{self.env_to_checking_floor:.2f}"),
+            *((f"  {scene} to t_intersection", f"{one:.2f}") for scene, one in self.scenes_to_t_intersection.items()),
             ("one gymnasium environment", f"{self.gym_env_steps_per_s:,.0f} steps/s"),
             *(row for cores in self.cores for row in cores.rows()),
             (f"recorder, {_RECORD_WORKERS} workers", f"{self.record_windows_per_s:,.0f} windows/s"),
@@ -163,7 +165,7 @@ class Benchmark:
 def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmark:
     """Measure everything, one after the other."""
     sizes = sizes or Sizes()
-    measurements = (_speed, _breakdown, _gym_speed, _cores, _record, _memory, _traits, _policies)
+    measurements = (_speed, _scenes, _breakdown, _gym_speed, _cores, _record, _memory, _traits, _policies)
     found: dict[str, Any] = {}
     with make_bar(total=len(measurements), desc="bench", unit="measurement", disable=not progress) as bar:
         for measurement in measurements:
@@ -175,8 +177,8 @@ def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmar
 class _Driven:
     """A Stable-Baselines3 environment under random actions."""
 
-    def __init__(self, sizes: Sizes, workers: int = 1, seed: int = 0) -> None:
-        self.env = SceneVecEnv(sizes.replicas, seed=seed, workers=workers)
+    def __init__(self, sizes: Sizes, workers: int = 1, seed: int = 0, scene: str = T_INTERSECTION) -> None:
+        self.env = SceneVecEnv(sizes.replicas, seed=seed, workers=workers, scene=scene)
         self._actions = np.random.default_rng(0).integers(3, size=(sizes.turn_steps, sizes.replicas))
         self.env.reset()
         for _ in range(_WARM_UP_STEPS):
@@ -207,8 +209,8 @@ class _Driven:
 
 
 @contextmanager
-def _driven(sizes: Sizes, workers: int = 1, seed: int = 0) -> Iterator[_Driven]:
-    driven = _Driven(sizes, workers, seed)
+def _driven(sizes: Sizes, workers: int = 1, seed: int = 0, scene: str = T_INTERSECTION) -> Iterator[_Driven]:
+    driven = _Driven(sizes, workers, seed, scene)
     try:
         yield driven
     finally:
@@ -229,6 +231,22 @@ def _speed(sizes: Sizes) -> dict[str, Any]:
         "env_to_floor": median(a / b for a, b in zip(env, floor, strict=True)),
         "checking_floor_env_steps_per_s": median(checking),
         "env_to_checking_floor": median(a / b for a, b in zip(env, checking, strict=True)),
+    }
+
+
+def _scenes(sizes: Sizes) -> dict[str, Any]:
+    """In turns: the environment of each scene, and that of the T-intersection."""
+    speeds: dict[str, list[float]] = {scene: [] for scene in ENV_IDS}
+    for turn in range(sizes.turns // 2 + 1):
+        for scene, found in speeds.items():
+            with _driven(sizes, seed=turn, scene=scene) as driven:
+                found.append(driven.steps_per_s())
+    paper = speeds.pop(T_INTERSECTION)
+    return {
+        "scenes_to_t_intersection": {
+            scene: median(one / other for one, other in zip(found, paper, strict=True))
+            for scene, found in speeds.items()
+        }
     }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, WINDOW_STEPS
+from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, POPULATIONS, WINDOW_STEPS
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, SCHEMA_VERSION, TRAJECTORIES
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
@@ -92,19 +92,18 @@ def steps_in_window(driver: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray((np.arange(len(driver)) - track_start) % WINDOW_STEPS)
 
 
-def load_labels(folder: Path, windows: Windows) -> NDArray[Any]:
-    """Whether each window's driver is conservative; (N,) bool. Never an input of a method without labels.
+def load_labels(folder: Path, windows: Windows) -> NDArray[np.int64]:
+    """Number of each window's driver's profile in its population; (N,). Never an input of a method without labels.
 
-    In a dataset of one's own SUMO configuration: (N,) int64, numbers of the drivers' vTypes in their sorted order.
+    In a dataset of one's own SUMO configuration: numbers of the drivers' vTypes in their sorted order.
 
     Raises:
         InputError: the labels are missing or do not belong to these windows.
     """
+    manifest = read_manifest(folder)
+    names = own_vtypes(manifest) or [profile.name for profile in POPULATIONS[manifest["population"]].profiles]
     trait = load_drivers(folder, windows, ["trait"])["trait"].astype(str)
-    vtypes = own_vtypes(read_manifest(folder))
-    if vtypes is None:
-        return np.asarray(trait == "conservative", bool)
-    return pd.Index(vtypes).get_indexer(pd.Index(trait)).astype(np.int64)
+    return pd.Index(names).get_indexer(pd.Index(trait)).astype(np.int64)
 
 
 def own_vtypes(manifest: Mapping[str, Any]) -> list[str] | None:

@@ -10,7 +10,7 @@ import pandas as pd
 import torch
 
 from tint_sumo import traits
-from tint_sumo.config import TraitSettings
+from tint_sumo.config import CONSERVATIVE_LABEL, TraitSettings
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, joined, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.errors import InputError
@@ -140,14 +140,14 @@ class TransferJob:
             self.out / "models" / self.name,
             method=self.method,
             seed=self.seed,
-            conservative=labels if find_trait_method(self.method).uses_labels else None,
+            conservative=labels == CONSERVATIVE_LABEL if find_trait_method(self.method).uses_labels else None,
             progress=False,
             card={"data": {"scenes": list(self.trained_on), "windows": len(windows)}},
         )
         return model, Probe(model, windows, labels, noise_m=self.study.noise_m, seed=self.seed)
 
     def _labelled(self, scenes: Sequence[str], *, test: bool) -> tuple[Windows, Any]:
-        """Training or test windows of some scenes, and whether their drivers are conservative."""
+        """Training or test windows of some scenes, and the labels of their drivers."""
         parts, labels = [], []
         for scene in scenes:
             data = _data(self.out, scene, "traits")

@@ -8,8 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo import traits
-from tint_sumo.config import LATENT_SIZE, TraitSettings
-from tint_sumo.dataset.windows import Windows, load_labels, load_windows, read_manifest, split_by_episode
+from tint_sumo.config import CONSERVATIVE_LABEL, LATENT_SIZE, TraitSettings
+from tint_sumo.dataset.windows import (
+    Windows,
+    load_labels,
+    load_windows,
+    own_vtypes,
+    read_manifest,
+    split_by_episode,
+)
 from tint_sumo.errors import InputError
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
 from tint_sumo.traits.figures import plot_latents, plot_reconstructions
@@ -54,6 +61,7 @@ def train_on_split(
 ) -> traits.TraitModel:
     """``train_traits`` on all ``windows`` of the dataset ``data``, loaded before; the trained model."""
     chosen, _ = split_by_episode(windows, TEST_FRACTION, seed)
+    uses_labels = find_trait_method(method).uses_labels
     return train(
         windows[chosen],
         settings,
@@ -61,7 +69,7 @@ def train_on_split(
         method=method,
         seed=seed,
         latent_size=latent_size,
-        conservative=load_labels(data, windows)[chosen] if find_trait_method(method).uses_labels else None,
+        conservative=_first_of_two(load_labels(data, windows)[chosen], method) if uses_labels else None,
         progress=progress,
         card={"data": describe(data)},
     )
@@ -98,9 +106,13 @@ def plot_traits(
         InputError: no usable dataset or model.
     """
     trained, windows, labels, seed = _load_for_test(data, model, noise_m, other_scene)
+    if own_vtypes(read_manifest(data)):
+        raise InputError(
+            "the picture is of conservative and aggressive drivers, and these are of vTypes; evaluate instead"
+        )
     _, unseen = split_by_episode(windows, TEST_FRACTION, seed)
     files = [out / "latent.png"]
-    plot_latents(trained, windows[unseen], labels[unseen], files[0], noise_m=noise_m)
+    plot_latents(trained, windows[unseen], labels[unseen] == CONSERVATIVE_LABEL, files[0], noise_m=noise_m)
     if isinstance(trained, Vae):
         files.append(out / "reconstruction.png")
         plot_reconstructions(trained, windows[unseen], files[1])
@@ -109,7 +121,7 @@ def plot_traits(
 
 def _load_for_test(
     data: Path, model: str | Path, noise_m: float, other_scene: bool
-) -> tuple[traits.TraitModel, Windows, NDArray[np.bool_], int]:
+) -> tuple[traits.TraitModel, Windows, NDArray[np.int64], int]:
     """A model, a dataset it may be tested on, its labels, and the seed of the split into training and test."""
     require_noise(noise_m)
     trained = traits.load(model)
@@ -118,6 +130,17 @@ def _load_for_test(
     _require_unseen(data, model)
     windows = load_windows(data)
     return trained, windows, load_labels(data, windows), int(read_card(model).get("seed", 0))
+
+
+def _first_of_two(labels: NDArray[np.int64], method: str) -> NDArray[np.bool_]:
+    """Which drivers are of the first of two kinds: conservative, or of the first vType."""
+    kinds = np.unique(labels)
+    if len(kinds) != 2:
+        raise InputError(
+            f"method {method} tells two kinds of drivers apart, and these windows have {len(kinds)}; "
+            "choose a method without labels"
+        )
+    return np.asarray(labels == kinds[0])
 
 
 def require_noise(noise_m: float) -> None:

@@ -60,7 +60,7 @@ class Probe:
     Args:
         model: a trained model; it is not changed.
         windows: N windows to fit on.
-        conservative: (N,) the label of each window's driver.
+        labels: (N,) the kind of each window's driver.
         noise_m: standard deviation of the noise on every position, here and in ``score``.
         seed: of the noise and of the neighbours' choice.
 
@@ -72,24 +72,24 @@ class Probe:
         self,
         model: TraitModel,
         windows: Windows,
-        conservative: NDArray[np.bool_],
+        labels: NDArray[np.integer],
         *,
         noise_m: float = 0.0,
         seed: int = 0,
     ) -> None:
-        if len(np.unique(conservative)) < 2:
+        if len(np.unique(labels)) < 2:
             raise InputError(
                 "both traits and several episodes are needed to evaluate; record a larger dataset of population traits"
             )
         self._model, self._noise_m, self._seed = model, noise_m, seed
         mean = encode_windows(model, windows, noise_m=noise_m, seed=seed).mean
         reference = np.random.default_rng(seed).permutation(len(mean))[:KNN_REFERENCES]
-        self._linear: Pipeline = make_pipeline(StandardScaler(), LinearSVC()).fit(mean, conservative)
+        self._linear: Pipeline = make_pipeline(StandardScaler(), LinearSVC()).fit(mean, labels)
         neighbours = KNeighborsClassifier(min(NEIGHBOURS, len(reference)))
         self._nearest: Pipeline = make_pipeline(StandardScaler(), neighbours)
-        self._nearest.fit(mean[reference], conservative[reference])
+        self._nearest.fit(mean[reference], labels[reference])
 
-    def score(self, windows: Windows, conservative: NDArray[np.bool_]) -> TraitAccuracy:
+    def score(self, windows: Windows, labels: NDArray[np.integer]) -> TraitAccuracy:
         """Accuracy on N windows, which the probe should not have been fitted on; the noise is drawn from its seed.
 
         Raises:
@@ -98,8 +98,8 @@ class Probe:
         if len(windows) == 0:
             raise InputError("there are no windows to evaluate on; record a larger dataset")
         latents = encode_windows(self._model, windows, noise_m=self._noise_m, seed=self._seed + 1)
-        correct = self._linear.predict(latents.mean) == conservative
-        nearest = self._nearest.predict(latents.mean) == conservative
+        correct = self._linear.predict(latents.mean) == labels
+        nearest = self._nearest.predict(latents.mean) == labels
         length, has_leader = windows.length, windows.has_leader
         return TraitAccuracy(
             accuracy=float(correct.mean()),
@@ -116,14 +116,14 @@ class Probe:
 
 
 def evaluate(
-    model: TraitModel, windows: Windows, conservative: NDArray[np.bool_], *, noise_m: float = 0.0, seed: int = 0
+    model: TraitModel, windows: Windows, labels: NDArray[np.integer], *, noise_m: float = 0.0, seed: int = 0
 ) -> TraitAccuracy:
     """Fit classifiers on two thirds of the episodes and test them on the rest (paper IV-B).
 
     Args:
         model: a trained model; it is not changed.
         windows: N windows.
-        conservative: (N,) the label of each window's driver.
+        labels: (N,) the kind of each window's driver.
         noise_m: standard deviation of the noise on every position.
         seed: of the split. Use the one of training, so that the test episodes are unseen by the model too.
 
@@ -131,8 +131,8 @@ def evaluate(
         InputError: the training part does not hold both traits, or the test part is empty.
     """
     train, test = split_by_episode(windows, TEST_FRACTION, seed)
-    probe = Probe(model, windows[train], conservative[train], noise_m=noise_m, seed=seed)
-    return probe.score(windows[test], conservative[test])
+    probe = Probe(model, windows[train], labels[train], noise_m=noise_m, seed=seed)
+    return probe.score(windows[test], labels[test])
 
 
 def linear_r2(

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, NO_LEADER_GAP_M, STEP_S, WINDOW_STEPS, VehicleShape
 from tint_sumo.dataset.windows import Windows
-from tint_sumo.errors import InputError
 from tint_sumo.files import whole_file
 from tint_sumo.traits.evaluation import encode_windows
 from tint_sumo.traits.model import TraitModel
@@ -41,14 +40,7 @@ def plot_latents(
         file: where the PNG goes.
         noise_m: standard deviation of the noise on every position.
         seed: of the part that is drawn, and of the noise.
-
-    Raises:
-        InputError: the labels are numbers of vTypes.
     """
-    if conservative.dtype != np.bool_:
-        raise InputError(
-            "the picture is of conservative and aggressive drivers, and these are of vTypes; evaluate instead"
-        )
     chosen = np.random.default_rng(seed).permutation(len(windows))[:DRAWN_WINDOWS]
     drawn, is_conservative = windows[chosen], conservative[chosen]
     latents = encode_windows(model, drawn, noise_m=noise_m, seed=seed).mean

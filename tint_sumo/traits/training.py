@@ -36,7 +36,7 @@ def train(
     method: str = "vae",
     seed: int = 0,
     latent_size: int = LATENT_SIZE,
-    conservative: NDArray[np.bool_ | np.int64] | None = None,
+    conservative: NDArray[np.bool_] | None = None,
     progress: bool = True,
     card: Mapping[str, Any] | None = None,
 ) -> TraitModel:
@@ -53,7 +53,6 @@ def train(
         seed: of the initial weights, the order of windows and all noise.
         latent_size: numbers that represent a trait.
         conservative: (N,) the true traits, for a method that is trained with them; no other method may have them.
-            Numbers of vTypes instead if they are of just two, of which the first one counts as conservative.
         progress: show a progress bar on stderr.
         card: what else the model's card shall say, such as where the windows come from.
 
@@ -61,15 +60,13 @@ def train(
         The trained model in evaluation mode.
 
     Raises:
-        InputError: unknown method, no windows, labels of other than two kinds of drivers, ``out`` holds another run, or
-            its checkpoint is damaged.
+        InputError: unknown method, no windows, ``out`` holds another run, or its checkpoint is damaged.
     """
     model_type = find_trait_method(method)
     if len(windows.length) == 0:
         raise InputError("there are no windows to train on; record a dataset with more of them")
     if model_type.uses_labels is not (conservative is not None):
         raise ValueError(f"labels are for the methods that learn with them: {method}.uses_labels")
-    classes = None if conservative is None else _two_classes(conservative, method)
     identity = {
         "task": "traits train",
         "method": method,
@@ -85,7 +82,7 @@ def train(
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(_stream_seed(seed, 0))
             model = model_type(settings, latent_size)
-        labels = None if classes is None else torch.from_numpy(classes)
+        labels = None if conservative is None else torch.from_numpy(conservative)
         data = TrainingWindows(windows, labels, with_other=model_type.uses_other_window)
         run = _Run(model, data, settings, seed)
         loss = run.fit(out / CHECKPOINT_FILE, progress)
@@ -94,19 +91,6 @@ def train(
         save(model, out / RUN_MODEL, {**known, "loss": loss, **(card or {})})
         (out / CHECKPOINT_FILE).unlink(missing_ok=True)
         return model.eval().requires_grad_(False)
-
-
-def _two_classes(labels: NDArray[np.bool_ | np.int64], method: str) -> NDArray[np.bool_]:
-    """Whether a driver is conservative or, if the labels are numbers of vTypes, of the first one."""
-    if labels.dtype == np.bool_:
-        return labels.astype(bool)
-    found = np.unique(labels)
-    if len(found) != 2:
-        raise InputError(
-            f"method {method} tells two kinds of drivers apart, and these windows have {len(found)} vTypes; "
-            "choose a method without labels"
-        )
-    return np.asarray(labels == found[0])
 
 
 class _Run:

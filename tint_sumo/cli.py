@@ -307,6 +307,8 @@ class TrainPolicy(Command):
     traits: str | None = None
     """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file; the
     shipped one of the method if not given."""
+    other_scene: bool = False
+    """Take a trait model that was trained in another scene, too."""
     zip: bool = False
     """Write the policy as Stable-Baselines3's policy.zip, too. That is a pickle: others must trust you to read it."""
 
@@ -328,6 +330,7 @@ class TrainPolicy(Command):
                 settings=settings,
                 scene=self.scene,
                 traits=self.traits,
+                other_scene=self.other_scene,
                 with_zip=self.zip,
                 report=report,
             )

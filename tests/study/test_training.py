@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -419,3 +420,11 @@ def test_a_zip_file_is_written_on_demand_and_read_with_permission(tmp_path: Path
         for one in (load_policy(policy), load_policy(tmp_path / ZIP_FILE, allow_pickle=True))
     ]
     np.testing.assert_array_equal(*actions)
+
+
+def test_a_trait_model_of_another_scene_is_refused_unless_it_is_asked_for(tmp_path: Path, tiny: PpoSettings) -> None:
+    there = partial(train_policy, "vae", 0.5, 8, 0, tmp_path / "policy", settings=tiny, scene="roundabout")
+    with pytest.raises(InputError, match="vae was trained in scene t_intersection, the policy is of scene roundabout"):
+        there()
+    assert not (tmp_path / "policy").exists()
+    assert there(other_scene=True).exists()

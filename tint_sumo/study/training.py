@@ -32,7 +32,7 @@ from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, digest_of
 from tint_sumo.study.evaluation import CASE_SEED, require_seed
 from tint_sumo.study.methods import Learned, find_learned
 from tint_sumo.traits import TraitModel
-from tint_sumo.traits.storage import read_card, save
+from tint_sumo.traits.storage import read_card, require_scene, save
 
 CHECKPOINT_FILE = "checkpoint.zip"
 CHECKPOINT_INTERVAL_S = 15.0
@@ -59,6 +59,7 @@ def train_policy(
     settings: PpoSettings,
     scene: str = T_INTERSECTION,
     traits: str | Path | None = None,
+    other_scene: bool = False,
     with_zip: bool = False,
     report: Report = silent,
 ) -> Path:
@@ -77,6 +78,7 @@ def train_policy(
         settings: network and PPO; its ``total_steps`` is not used.
         scene: name of the scene it trains in, or ``"all"``.
         traits: trait model by name or path, for methods that infer traits; the shipped one if not given.
+        other_scene: take a trait model that was trained in another scene, too.
         with_zip: write the policy as Stable-Baselines3's policy.zip, too.
         report: told of the progress.
 
@@ -92,6 +94,8 @@ def train_policy(
     if steps < 1:
         raise InputError(f"steps must be at least 1, not {steps}")
     encoder = _load_encoder(learned, traits)
+    if encoder is not None and not other_scene:
+        require_scene(traits or str(learned.encoder), scene, digest_of(scene), "the policy")
     settings = replace(settings, policy=replace(settings.policy, attention=learned.attention))
     identity = {
         "kind": "policy",

@@ -21,7 +21,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
 from tint_sumo.traits.figures import plot_latents, plot_reconstructions
 from tint_sumo.traits.model import find_trait_method
-from tint_sumo.traits.storage import read_card
+from tint_sumo.traits.storage import read_card, require_scene
 from tint_sumo.traits.training import train
 from tint_sumo.traits.vae import Vae
 
@@ -126,7 +126,8 @@ def _load_for_test(
     require_noise(noise_m)
     trained = traits.load(model)
     if not other_scene:
-        _require_same_scene(data, model)
+        here = describe(data)
+        require_scene(model, here["scene"], here["scene_digest"], str(data))
     _require_unseen(data, model)
     windows = load_windows(data)
     return trained, windows, load_labels(data, windows), int(read_card(model).get("seed", 0))
@@ -153,16 +154,6 @@ def describe(data: Path) -> dict[str, Any]:
     """What a model's card says about the dataset it was trained on."""
     manifest = read_manifest(data)
     return {key: manifest[key] for key in ("scene", "scene_digest", "p_conservative", "population", "seed", "windows")}
-
-
-def _require_same_scene(data: Path, model: str | Path) -> None:
-    """Raise InputError if the model was trained in another scene, or in an earlier version of this one."""
-    trained_on, here = read_card(model).get("data") or {}, describe(data)
-    if trained_on.get("scene_digest", here["scene_digest"]) != here["scene_digest"]:
-        raise InputError(
-            f"{model} was trained in scene {trained_on.get('scene')}, {data} is of scene {here['scene']}; "
-            "say --other-scene to use it all the same"
-        )
 
 
 def _require_unseen(data: Path, model: str | Path) -> None:

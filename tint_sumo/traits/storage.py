@@ -64,6 +64,16 @@ def read_card(name_or_path: str | Path) -> dict[str, Any]:
     return _checked_card(find(name_or_path))
 
 
+def require_scene(name_or_path: str | Path, scene: str, digest: str, user: str) -> None:
+    """Raise InputError if a model was trained in another scene than its user is of, or in another version of it."""
+    data = read_card(name_or_path).get("data") or {}
+    if data.get("scene_digest", digest) != digest:
+        raise InputError(
+            f"trait model {name_or_path} was trained in scene {data.get('scene')}, {user} is of scene {scene}; "
+            "say --other-scene to use it all the same"
+        )
+
+
 def add_to_card(name_or_path: str | Path, entries: Mapping[str, Any]) -> None:
     """Add what was found out about a saved model, such as its accuracy, to its card."""
     stem = find(name_or_path)

@@ -39,6 +39,7 @@ COMMANDS = (
     "policy evaluate",
     "study run",
     "study report",
+    "render",
     "bench",
 )
 
@@ -173,6 +174,15 @@ def test_policy_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
     assert low <= printed["success"] <= high
 
 
+def test_render(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ("render", "--model", "always_go", "--p-conservative", 0.4, "--case", 3, "--out", tmp_path / "film.gif")
+    printed = run(capsys, *argv)
+    assert {key: printed[key] for key in ("case", "outcome", "time_s", "frames")} == {
+        "case": 3, "outcome": "collision", "time_s": 2.4, "frames": 25
+    }  # fmt: skip
+    assert [path.name for path in tmp_path.iterdir()] == ["film.gif"]
+
+
 def test_record_in_the_format_of_sumo(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = copy(dataset, tmp_path / "copy")
     run(capsys, "record", "--windows", 100, "--out", out, "--format", "fcd")
@@ -293,6 +303,10 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ("policy evaluate --model ttc --seed -1", "seed"),
         ("study run --workers 0 --out OUT", "workers"),
         ("study report --out NOWHERE", "no results in"),
+        ("render --model always_go --out film.avi", "a film ends in .mp4, .gif, .png"),
+        ("render --model always_go --out film.gif --case -1", "case must lie in 0 to 999999, not -1"),
+        ("render --model magic --out film.gif", "no policy magic"),
+        ("render --model always_go --out film.gif --p-conservative 2", "p_conservative"),
     ],
 )
 def test_bad_values(

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -453,6 +453,47 @@ class StudyScenes(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Render(Command):
+    """Film one unseen case: who drives how, what the policy takes them for, where it looks, what it does."""
+
+    model: str
+    """A shipped policy by its method's name (streaming, oracle, ...), always_go, ttc, the folder of a training run, a
+    .safetensors file, or with --allow-pickle a .zip file."""
+    out: Path
+    """The film, .mp4 (needs tint_sumo[video]) or .gif, or a strip of eight moments, .png."""
+    p_conservative: ShareFlag | None = None
+    """Probability that a driver is conservative, 0 to 1, or two numbers between which the case draws its own; those
+    of the policy's training if not given."""
+    case: int = 0
+    """Number of the case; the same cases as in policy evaluate."""
+    seed: int = 0
+    """Which set of cases, 0 to 1000."""
+    scene: str | None = None
+    """Scene; the one the policy was trained in if not given, for always_go and ttc t_intersection."""
+    noise: float = 0.0
+    """Standard deviation of the noise on the others' positions, m; the film shows where they are."""
+    tau: float = 1.0
+    """Time headway of the other drivers, s."""
+    allow_pickle: bool = False
+    """Read .zip files, which can run any code: only for files you trust."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.progress import progress_bar
+        from tint_sumo.study.film import render_case
+        from tint_sumo.study.loading import load_policy
+
+        _use_one_thread()
+        contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
+        share = contender.p_conservative if self.p_conservative is None else _share(self.p_conservative)
+        world = {"p_conservative": share, "position_noise_m": self.noise, "tau_s": self.tau}
+        with progress_bar(str(self.out), "frame") as report:
+            film = render_case(contender, self.case, self.out, seed=self.seed, report=report, **world)
+        text = f"{film.outcome} after {film.time_s:.1f} s, {film.frames} frames: {self.out}"
+        content = {"model": self.model, "scene": contender.scene, **world, "case": self.case, "seed": self.seed}
+        return Outcome(text, {**content, "out": str(self.out), **asdict(film)})
+
+
+@dataclass(frozen=True, kw_only=True)
 class Bench(Command):
     """Measure how fast the environments and the recorder are on this machine, against SUMO's own speed."""
 
@@ -516,6 +557,7 @@ class TintSumo:
         | Annotated[Traits, subcommand("traits")]
         | Annotated[Policy, subcommand("policy")]
         | Annotated[Study, subcommand("study")]
+        | Annotated[Render, subcommand("render")]
         | Annotated[Bench, subcommand("bench")]
     )
 

@@ -36,7 +36,8 @@ def render_scene(simulation: Simulation | OwnSimulation, replica: int) -> NDArra
     """Draw one replica as an (H, W, 3) image."""
     if isinstance(simulation, OwnSimulation):
         return _render_own(simulation)
-    canvas = _Canvas(simulation.scene.view, _background(simulation.layout).copy())
+    view = simulation.scene.view
+    canvas = Canvas(view, background(simulation.layout, view).copy())
     slots, shape = simulation.slots, simulation.scene.vehicle
     for slot in np.flatnonzero(slots.present[replica]).tolist():
         profile = simulation.population[slots.member[replica, slot]].profile
@@ -51,7 +52,7 @@ def _render_own(simulation: OwnSimulation) -> NDArray[np.uint8]:
     ego, slots = simulation.egos.pose[0], simulation.slots
     x_m, y_m, across_m, up_m = float(ego["x_m"]), float(ego["y_m"]), *_AROUND_M
     view = View(x_m - across_m, y_m - up_m, x_m + across_m, y_m + up_m)
-    canvas = _Canvas(view)
+    canvas = Canvas(view)
     roads = _network_roads(simulation.scene.config.net_file)
     corners_m = np.array([[view.left_m, view.bottom_m], [view.right_m, view.top_m]]) + simulation.origin_m
     for road in roads.geometries[roads.query(shapely.box(*corners_m.reshape(-1)))]:
@@ -77,9 +78,9 @@ def _network_roads(net_file: Path) -> shapely.STRtree:
 
 
 @cache
-def _background(layout: Layout) -> Image.Image:
-    """The empty roads."""
-    canvas = _Canvas(layout.scene.view)
+def background(layout: Layout, view: View, width_px: int = _WIDTH, oversampling: int = _OVERSAMPLING) -> Image.Image:
+    """The empty roads, as a canvas of the same arguments has them; not to be drawn on."""
+    canvas = Canvas(view, width_px=width_px, oversampling=oversampling)
     canvas.fill(layout.roads, _ROAD)
     half_m, dash = layout.scene.network.lane_width_m / 2, round(_DASH_M / SPACING_M)
     for route in layout.routes:
@@ -93,43 +94,55 @@ def _background(layout: Layout) -> Image.Image:
     return canvas.drawing
 
 
-class _Canvas:
-    def __init__(self, view: View, drawing: Image.Image | None = None) -> None:
-        self._left_m, self._top_m = view.left_m, view.top_m
-        self._scale = _WIDTH / (view.right_m - view.left_m) * _OVERSAMPLING
-        size = (_WIDTH * _OVERSAMPLING, round((view.top_m - view.bottom_m) * self._scale))
-        self.drawing = drawing or Image.new("RGB", size, _GRASS)
-        self._draw = ImageDraw.Draw(self.drawing)
+class Canvas:
+    """A top view in metres, drawn ``oversampling`` times as large as it is wanted; colours may have an opacity."""
 
-    def _pixels(self, points_m: Floats) -> list[tuple[float, float]]:
-        across, down = (points_m[:, 0] - self._left_m) * self._scale, (self._top_m - points_m[:, 1]) * self._scale
+    def __init__(
+        self,
+        view: View,
+        drawing: Image.Image | None = None,
+        *,
+        width_px: int = _WIDTH,
+        oversampling: int = _OVERSAMPLING,
+    ) -> None:
+        self._left_m, self._top_m = view.left_m, view.top_m
+        self.pixels_per_m = width_px / (view.right_m - view.left_m) * oversampling
+        self._oversampling = oversampling
+        half_height_px = round((view.top_m - view.bottom_m) * self.pixels_per_m / oversampling / 2)
+        size = (width_px * oversampling, 2 * half_height_px * oversampling)  # even, as videos have to be
+        self.drawing = drawing or Image.new("RGB", size, _GRASS)
+        self.draw = ImageDraw.Draw(self.drawing, "RGBA")
+
+    def pixels(self, points_m: Floats) -> list[tuple[float, float]]:
+        across, down = (
+            (points_m[:, 0] - self._left_m) * self.pixels_per_m,
+            (self._top_m - points_m[:, 1]) * self.pixels_per_m,
+        )
         return list(zip(across.tolist(), down.tolist(), strict=True))
 
     def fill(self, shape: shapely.Geometry, colour: str | tuple[int, ...]) -> None:
         for part in shapely.get_parts(shape):
-            self._draw.polygon(self._pixels(shapely.get_coordinates(part.exterior)), fill=colour)
+            self.draw.polygon(self.pixels(shapely.get_coordinates(part.exterior)), fill=colour)
             for hole in part.interiors:
-                self._draw.polygon(self._pixels(shapely.get_coordinates(hole)), fill=_GRASS)
+                self.draw.polygon(self.pixels(shapely.get_coordinates(hole)), fill=_GRASS)
 
     def vehicle(self, pose: np.void, length_m: float, width_m: float, colour: tuple[int, ...]) -> None:
         """A box with its windscreen towards the front."""
+        half_length_m, half_width_m = length_m / 2, width_m / 2
+        self.draw.polygon(self.box(pose, (-half_length_m, half_length_m), (-half_width_m, half_width_m)), fill=colour)
+        half_glass_m = 0.8 * half_width_m
+        self.draw.polygon(self.box(pose, (0.16 * length_m, 0.3 * length_m), (-half_glass_m, half_glass_m)), fill=_GLASS)
+
+    def box(
+        self, pose: np.void, along_m: tuple[float, float], across_m: tuple[float, float]
+    ) -> list[tuple[float, float]]:
+        """Corners of a part of a vehicle: from and to, ahead of its centre and to its left."""
         centre = np.array([pose["x_m"], pose["y_m"]])
         ahead = np.array([pose["heading_x"], pose["heading_y"]])
         abreast = np.array([-ahead[1], ahead[0]])
-
-        def box(back_m: float, front_m: float, half_width_m: float) -> list[tuple[float, float]]:
-            corners = (
-                (back_m, -half_width_m),
-                (front_m, -half_width_m),
-                (front_m, half_width_m),
-                (back_m, half_width_m),
-            )
-            return self._pixels(np.array([centre + along * ahead + across * abreast for along, across in corners]))
-
-        half_length_m, half_width_m = length_m / 2, width_m / 2
-        self._draw.polygon(box(-half_length_m, half_length_m, half_width_m), fill=colour)
-        self._draw.polygon(box(0.16 * length_m, 0.3 * length_m, 0.8 * half_width_m), fill=_GLASS)
+        (back_m, front_m), (right_m, left_m) = along_m, across_m
+        corners = np.array([(back_m, right_m), (front_m, right_m), (front_m, left_m), (back_m, left_m)])
+        return self.pixels(centre + corners @ np.stack([ahead, abreast]))
 
     def image(self) -> NDArray[np.uint8]:
-        width, height = (side // _OVERSAMPLING for side in self.drawing.size)
-        return np.asarray(self.drawing.resize((width, height), Image.Resampling.LANCZOS))
+        return np.asarray(self.drawing.reduce(self._oversampling))

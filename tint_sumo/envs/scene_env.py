@@ -12,6 +12,8 @@ from tint_sumo.envs.rendering import RENDER_FPS, render_scene, require_render_mo
 from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, outcome_name
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
+from tint_sumo.simulation.own import OwnSimulation
+from tint_sumo.simulation.simulation import Simulation
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,11 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     def _step(self, actions: NDArray[np.int64]) -> None:
         self._actions.append(int(actions[0]))
         self._episodes.step(actions)
+
+    @property
+    def simulation(self) -> Simulation | OwnSimulation:
+        """What is simulated, to be looked at only; the environment is its replica 0."""
+        return self._episodes.simulation
 
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to come back to where the episode is now; it can be pickled.

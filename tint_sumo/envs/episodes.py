@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,7 @@ class TaskSettings:
         """What is told of each vehicle slot beside the observation."""
         return ("traits", *TRACKS) if self.tracks else ("traits",)
 
-    @property
+    @cached_property
     def played(self) -> Scene | OwnScene:
         """The scene with these settings in place of its own."""
         scene = find_scene(self.scene) if isinstance(self.scene, str) else self.scene

@@ -53,12 +53,14 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     ) -> None:
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, not {num_envs}")
-        alike: list[AnyScene] = [scene] if isinstance(scene, str | Scene | OwnScene) else []
-        scenes = alike * (1 if workers is None else workers) if alike else list(scene)  # type: ignore[arg-type]
+        if isinstance(scene, str | Scene | OwnScene):
+            scenes: Sequence[AnyScene] = [scene] * (1 if workers is None else workers)
+        elif workers in (None, len(scene)):
+            scenes = scene
+        else:
+            raise InputError(f"{len(scene)} scenes need as many workers, not {workers}; leave workers out")
         if not 1 <= len(scenes) <= num_envs:
             raise InputError(f"workers must be 1 to num_envs = {num_envs}, not {len(scenes)}")
-        if not alike and workers not in (None, len(scenes)):
-            raise InputError(f"{len(scenes)} scenes need as many workers, not {workers}; leave workers out")
         require_render_mode(render_mode)
         all_settings = [TaskSettings(one, **task) for one in scenes]
         settings = all_settings[0]

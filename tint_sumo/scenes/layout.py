@@ -7,7 +7,7 @@ their front bumper from the route's start; SUMO reports positions of the front b
 import tempfile
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path as FilePath
@@ -19,7 +19,7 @@ import sumolib
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from tint_sumo.config import VehicleShape
+from tint_sumo.config import Population, Traffic, VehicleShape
 from tint_sumo.errors import InputError
 from tint_sumo.scenes.geometry import POSE, SPACING_M, Floats, Poses, along, place, resample
 from tint_sumo.scenes.network import Point, build_network, name, plain_xml
@@ -75,18 +75,23 @@ class Layout:
     lane_on_route_m: (
         Floats  # (K, K, S): where on the first route each lane of the second one starts; NaN if it does not
     )
-    length_m: Floats  # (K,): of the routes
     ways: Floats  # (K, P, 2)
     roads: BaseGeometry  # the paved area, for pictures
 
 
 @cache
 def layout(scene: Scene) -> Layout:
-    """Build the scene's network once and look at it.
+    """Build the scene's network once, whoever drives there and however long, and look at it.
 
     Raises:
         InputError: a route does not exist or is not connected, or the scene does not fit its network.
     """
+    same_roads = replace(scene, traffic=Traffic(), population=Population(), time_limit_s=Scene.time_limit_s)
+    return replace(_layout(same_roads), scene=scene)
+
+
+@cache
+def _layout(scene: Scene) -> Layout:
     net = _read(scene)
     routes = tuple(_path(net, route.name, route.edges, scene, ()) for route in scene.routes)
     ego = _path(net, EGO, scene.ego.edges, scene, scene.ego.way)
@@ -100,7 +105,6 @@ def layout(scene: Scene) -> Layout:
         zones=_zones(scene, routes, ego.way),
         lane_start_m=_padded([path.lane_start_m for path in routes]),
         lane_on_route_m=_shared_lanes(routes),
-        length_m=np.array([path.length_m for path in routes]),
         ways=np.stack([resample(path.way, (points - 2) * SPACING_M)[:points] for path in routes]),
         roads=_roads(net),
     )

@@ -1,10 +1,10 @@
-# make install | study | test | net | clean. Another build of torch: make install TORCH=torch
+# make install | study | test | docs | net | clean. Another build of torch: make install TORCH=torch
 PYTHON ?= python3
 VENV ?= .venv
 TORCH ?=
 BIN := $(VENV)/bin
 
-.PHONY: install study test net clean
+.PHONY: install study test docs net clean
 
 install: $(VENV)/.installed
 
@@ -28,6 +28,10 @@ test: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/pytest -n 2
+
+docs: install
+	PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "open build/docs/index.html"
 
 net: install
 	$(BIN)/tint-sumo net --out sumo_net

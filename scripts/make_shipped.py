@@ -131,6 +131,13 @@ def picture_of(scene: str) -> NDArray[np.uint8]:
     return picture
 
 
+def make_films() -> None:
+    """A case that a shipped policy drives, as a film and as a strip."""
+    for name in ("case.gif", "strip.png"):
+        film = str(DATA / "images" / name)
+        run("render", "--model", "cross_window", "--p-conservative", "0.4", "--case", "1", "--out", film)
+
+
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit(__doc__)
@@ -138,4 +145,5 @@ if __name__ == "__main__":
     make_pictures()
     make_traits(Path(sys.argv[1]))
     make_policies(Path(sys.argv[1]))
+    make_films()
     make_scenes(Path(sys.argv[1]))

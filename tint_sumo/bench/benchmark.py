@@ -95,7 +95,7 @@ class Cores:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What :func:`run_benchmark` found.
+    """What ``run_benchmark`` found.
 
     The floor is SUMO's ``simulationStep`` alone, step after step with nothing in between, in the same simulation with
     the same vehicles on the street. It does less than the environment, which sees collisions where the simulation is

@@ -63,7 +63,7 @@ def shard_file(folder: Path, part: str, shard: int) -> Path:
 
 
 def shard_number(file: Path) -> int:
-    """Of a path made by :func:`shard_file`."""
+    """Of a path made by ``shard_file``."""
     return int(file.name.removeprefix("shard-").split(".")[0])
 
 

@@ -21,7 +21,7 @@ _SEED_LIMIT = 2**63
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """The arguments of all environments; :class:`~tint_sumo.envs.scene_env.SceneEnv` explains them.
+    """The arguments of all environments; ``tint_sumo.envs.scene_env.SceneEnv`` explains them.
 
     Raises:
         InputError: a value makes no sense.

@@ -171,7 +171,7 @@ def observe_tracks(
 
     Args:
         ego_front_m: (N,).
-        passed_m: (K,) see :class:`~tint_sumo.scenes.layout.ConflictZones`.
+        passed_m: (K,) see ``tint_sumo.scenes.layout.ConflictZones``.
         present, route, vehicles, front_m, leader, gap_m: (N, V) of the vehicle slots.
         noise_m: (N, V, 2) of the positions.
     """

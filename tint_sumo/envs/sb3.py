@@ -14,7 +14,7 @@ from tint_sumo.envs.vector import SceneVectorEnv
 class SceneVecEnv(VecEnv):
     """Stable-Baselines3 ``VecEnv`` of ``num_envs`` replicas of a scene in one simulation.
 
-    Takes the arguments of :class:`~tint_sumo.envs.scene_env.SceneEnv`. ``infos[i]`` holds ``traits``, the
+    Takes the arguments of ``tint_sumo.envs.scene_env.SceneEnv``. ``infos[i]`` holds ``traits``, the
     true traits that go with the returned observation; when an episode ends also ``terminal_observation``,
     ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``time_s`` and, after a collision, ``collision``.
     ``slots`` holds arrays (N, V) of what else is known of the vehicles in the returned observations, and

@@ -161,7 +161,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         return self._episodes.simulation
 
     def snapshot(self) -> Snapshot:
-        """What :meth:`restore` needs to come back to where the episode is now; it can be pickled.
+        """What ``restore`` needs to come back to where the episode is now; it can be pickled.
 
         Raises:
             InputError: no episode has begun.

@@ -21,7 +21,7 @@ AnyScene = str | Scene | OwnScene
 
 
 class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
-    """``num_envs`` times :class:`~tint_sumo.envs.scene_env.SceneEnv`, whose docstring is the manual.
+    """``num_envs`` times ``tint_sumo.envs.scene_env.SceneEnv``, whose docstring is the manual.
 
     Environment ``i`` seeded with ``seed + i`` lives through exactly the episodes of a single environment with that
     seed, whatever ``num_envs`` is. A finished episode is followed by the next one in the same step

@@ -58,7 +58,11 @@ class RecurrentPPO(OnPolicyAlgorithm):
         vf_coef: weight of the values' squared error.
         max_grad_norm: longer gradients are scaled down to this.
         policy_kwargs: further arguments of the policy.
-        stats_window_size, tensorboard_log, verbose, seed, device: as in Stable-Baselines3.
+        stats_window_size: as in Stable-Baselines3, like all that follow.
+        tensorboard_log: folder of the TensorBoard log.
+        verbose: 1 prints what is logged.
+        seed: of weights, actions and environments.
+        device: of the network.
 
     Raises:
         InputError: more minibatches than environments.

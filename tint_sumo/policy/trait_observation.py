@@ -18,7 +18,7 @@ class TraitObservation(VecEnvWrapper):
     """Adds traits, (V, size) under a key, to the observations of a scene, terminal ones included.
 
     Args:
-        venv: a :class:`~tint_sumo.envs.sb3.SceneVecEnv`, or a wrapper around one.
+        venv: a ``tint_sumo.envs.sb3.SceneVecEnv``, or a wrapper around one.
         source: where the traits come from; for one environment only.
         key: ``"traits"``, or ``"true_traits"`` for those that only a critic may see.
 

@@ -23,7 +23,7 @@ class Frame:
     """What N environments show at one time, of V vehicle slots each."""
 
     observation: Observation  # arrays (N, ...)
-    slots: dict[str, np.ndarray]  # arrays (N, V), see :class:`tint_sumo.envs.sb3.SceneVecEnv`
+    slots: dict[str, np.ndarray]  # arrays (N, V), see ``tint_sumo.envs.sb3.SceneVecEnv``
     done: np.ndarray  # (N,) bool, whether the last step ended the episode
 
     @property
@@ -166,7 +166,7 @@ class EncoderTraits(TraitSource):
 
 
 class ClassifierTraits(EncoderTraits):
-    """The classes that a supervised classifier predicts, in the form of :class:`OracleTraits`, at the same times.
+    """The classes that a supervised classifier predicts, in the form of ``OracleTraits``, at the same times.
 
     With a policy trained on true traits this is the pipeline of Ma et al. (2020) as the paper has it (IV-C).
     """

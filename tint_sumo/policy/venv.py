@@ -27,7 +27,7 @@ def policy_venv(
         action_repeat: simulation steps per decision.
         critic_sees_true_traits: observe the true traits, too, under a key of their own.
         monitored: count steps and rewards of each episode for Stable-Baselines3's logger.
-        task: as in :class:`~tint_sumo.envs.scene_env.SceneEnv`.
+        task: as in ``tint_sumo.envs.scene_env.SceneEnv``.
     """
     venv: VecEnv = SceneVecEnv(num_envs, tracks=source is not None and source.needs_tracks, **task)
     if source is not None:

@@ -20,7 +20,7 @@ _MARK = f"{_WRITTEN_BY}; change tint_sumo/scenes and run it again. -->\n"
 
 
 def scene_files(scene: Scene, replicas: int, spacing_m: float = REPLICA_SPACING_M) -> dict[str, str]:
-    """Name and text of every file of a scene; ``spacing_m`` as in :func:`~tint_sumo.scenes.network.plain_xml`.
+    """Name and text of every file of a scene; ``spacing_m`` as in ``tint_sumo.scenes.network.plain_xml``.
 
     Raises:
         InputError: fewer than one replica.

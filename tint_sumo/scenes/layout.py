@@ -40,7 +40,7 @@ class Path:
     lanes: tuple[str, ...]  # ids, with ``{replica}`` for the replica's number
     lane_start_m: Floats  # (S,): where each of them starts
     length_m: float
-    way: Floats  # (P, 2): see :mod:`tint_sumo.scenes.geometry`
+    way: Floats  # (P, 2): see ``tint_sumo.scenes.geometry``
 
     def lane_at(self, front_m: float) -> tuple[int, float]:
         """Number of the lane at a distance from the route's start, and the position on it."""
@@ -53,7 +53,7 @@ class Path:
 class ConflictZones:
     """Where the ego's way meets the K routes of the traffic; arc lengths, infinite where it does not.
 
-    The ego's are those of its front: where it (or its box, see :class:`tint_sumo.config.Claim`) enters the route's
+    The ego's are those of its front: where it (or its box, see ``tint_sumo.config.Claim``) enters the route's
     lane, where it stands in the vehicles' path, and where its centre has left the lane on the other side (never, where
     it merges).
     """

@@ -53,7 +53,7 @@ class SumoConfig:
 
 @dataclass(frozen=True)
 class OwnScene:
-    """A SUMO configuration and the ego's task in it; :func:`from_sumocfg` makes one.
+    """A SUMO configuration and the ego's task in it; ``from_sumocfg`` makes one.
 
     Lengths along the ego's route are those that SUMO's odometer shows, lanes on junctions included. Vehicles are seen
     up to ``sight_m`` away, the nearest ``max_vehicles`` of them.

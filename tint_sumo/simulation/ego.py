@@ -28,7 +28,7 @@ class Collision:
 
 
 class EgoRules(NamedTuple):
-    """What the controller of a scene comes down to (see :mod:`tint_sumo.config`)."""
+    """What the controller of a scene comes down to (see ``tint_sumo.config``)."""
 
     gain_per_s: float
     accel_limit_mps2: float
@@ -68,7 +68,7 @@ class Egos:
     =============== ======= ======================================================================
     ``front_m``     (R,)    front bumper's distance along the ego's way
     ``speed_mps``   (R,)
-    ``pose``        (R,)    records of :data:`~tint_sumo.scenes.geometry.POSE`
+    ``pose``        (R,)    records of ``tint_sumo.scenes.geometry.POSE``
     ``distance_m``  (R, V)  from its box to the vehicles' boxes; infinite if far, or where there is none
     ``unsafe``      (R,)    what the safety check says for the next step
     ``has_claimed`` (R, K)  which of the traffic's routes it claims
@@ -249,7 +249,7 @@ def update_claims(
 
     Args:
         front_m, speed_mps: (R,).
-        enter_m, inside_m, towards: (K,), (K,) and (K, P); see :class:`~tint_sumo.scenes.layout.ConflictZones`.
+        enter_m, inside_m, towards: (K,), (K,) and (K, P); see ``tint_sumo.scenes.layout.ConflictZones``.
     """
     any_changed = False
     for row in range(len(front_m)):

@@ -107,7 +107,7 @@ def refusals(config: SumoConfig) -> Iterator[None]:
 
 
 class OwnSlots:
-    """The vehicles around the ego in V slots; arrays are (1, V), as in :class:`tint_sumo.simulation.slots.Slots`.
+    """The vehicles around the ego in V slots; arrays are (1, V), as in ``tint_sumo.simulation.slots.Slots``.
 
     ``member`` is the number of a vehicle's vType, ``front_m`` what its odometer shows, and ``length_m`` and ``width_m``
     are its size. The nearest vehicles in sight have slots. A vehicle keeps its slot while it is one of them, and a slot
@@ -168,7 +168,7 @@ def pose_of(sight: Sight, length_m: float, origin_m: tuple[float, float]) -> tup
 
 
 class OwnEgos:
-    """The one ego; arrays are (1,), as in :class:`tint_sumo.simulation.ego.Egos`."""
+    """The one ego; arrays are (1,), as in ``tint_sumo.simulation.ego.Egos``."""
 
     def __init__(self, scene: OwnScene) -> None:
         self._scene = scene
@@ -230,9 +230,9 @@ class OwnEgos:
 
 
 class OwnSimulation:
-    """One replica of a scene of one's own; empty until its first :meth:`reset`.
+    """One replica of a scene of one's own; empty until its first ``reset``.
 
-    Read-only state: the vehicles in ``slots`` (:class:`OwnSlots`) and the ego in ``egos`` (:class:`OwnEgos`), both in a
+    Read-only state: the vehicles in ``slots`` (``OwnSlots``) and the ego in ``egos`` (``OwnEgos``), both in a
     frame with the network's axes, whose origin is where the ego's centre is at the episode's start.
     """
 

@@ -24,11 +24,11 @@ from tint_sumo.simulation.yielding import Yielding
 
 
 class Simulation:
-    """A batch of ``replicas`` of a scene, each empty until its first :meth:`reset`.
+    """A batch of ``replicas`` of a scene, each empty until its first ``reset``.
 
     Read-only state: ``time_s`` (R,) since the episodes' start, the vehicles in ``slots``
-    (:class:`~tint_sumo.simulation.slots.Slots`), the egos in ``egos`` (:class:`~tint_sumo.simulation.ego.Egos`), and
-    who yields to them in ``yielding`` (:class:`~tint_sumo.simulation.yielding.Yielding`). At most ``max_vehicles`` of
+    (``tint_sumo.simulation.slots.Slots``), the egos in ``egos`` (``tint_sumo.simulation.ego.Egos``), and
+    who yields to them in ``yielding`` (``tint_sumo.simulation.yielding.Yielding``). At most ``max_vehicles`` of
     the scene are on its roads; further ones wait outside.
     """
 

@@ -16,7 +16,7 @@ class Slots:
     ``route``          number of its route
     ``stage``          on which of the route's SUMO lanes it is
     ``front_m``        front bumper's distance along the route
-    ``pose``           records of :data:`~tint_sumo.scenes.geometry.POSE`; ``x_m`` and ``y_m`` are its fields
+    ``pose``           records of ``tint_sumo.scenes.geometry.POSE``; ``x_m`` and ``y_m`` are its fields
     ``member``         index into the population, -1 in empty slots
     ``vehicle_number`` running number of the vehicle in its replica's episode, -1 in empty slots
     ``newest``         (R, K) slot of the vehicle that entered each route last, -1 if it has left

@@ -11,7 +11,7 @@ from tint_sumo.simulation.slots import Slots
 
 
 class Yielding:
-    """``reacts`` (R, V): who reacts to the ego's claim on their route; see :class:`tint_sumo.config.Claim`."""
+    """``reacts`` (R, V): who reacts to the ego's claim on their route; see ``tint_sumo.config.Claim``."""
 
     def __init__(
         self, replicas: int, population: tuple[DriverMember, ...], layout: Layout, slots: Slots, link: SumoLink

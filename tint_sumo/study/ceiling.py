@@ -22,7 +22,7 @@ def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str = T_
     takes risks can: it may slip through before an aggressive driver.
 
     Args:
-        p_conservative, episodes, seed: of the cases, see :func:`tint_sumo.study.evaluation.evaluate`.
+        p_conservative, episodes, seed: of the cases, see ``tint_sumo.study.evaluation.evaluate``.
         scene: name of the scene.
     """
     played = find_scene(scene)

@@ -138,7 +138,7 @@ class _Speeds:
 def drive_case(contender: Contender, case: int, seed: int, **task: Any) -> Iterator[Moment]:
     """Every simulation step of case ``case`` of the set ``seed``, the beginning included; ``task`` as in ``SceneEnv``.
 
-    The case goes as it does in :func:`~tint_sumo.study.evaluation.evaluate`: the policy decides every
+    The case goes as it does in ``tint_sumo.study.evaluation.evaluate``: the policy decides every
     ``action_repeat`` steps.
     """
     stage, driver = _Stage(contender, task), _Driver(contender)

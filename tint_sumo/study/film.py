@@ -51,7 +51,7 @@ def render_case(
 
     Args:
         contender: who drives.
-        case: number of the case, as in :func:`~tint_sumo.study.evaluation.evaluate`.
+        case: number of the case, as in ``tint_sumo.study.evaluation.evaluate``.
         out: .mp4, .gif or .png file.
         seed: which set of cases, 0 to 1000.
         p_conservative: as in ``SceneEnv``; that of the contender if not given.

@@ -75,7 +75,7 @@ class TrackStream:
     def _evidence(self, hidden: Tensor) -> Tensor:
         """Of windows with these states (K, hidden): precision beyond the prior's, and precision times mean.
 
-        Both add up over windows; see :func:`tint_sumo.traits.cross_window.fuse`. (K, 2, latent_size).
+        Both add up over windows; see ``tint_sumo.traits.cross_window.fuse``. (K, 2, latent_size).
         """
         mean, log_var = self._model.encoder.heads(hidden)
         precision = torch.exp(-log_var).clamp(min=1.0)

@@ -1,0 +1,99 @@
+"""The README and the documentation: what they tell their readers to type works, and their tables are the results'."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.documents import blocks
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+DOCS = ROOT / "docs"
+TYPED = [
+    README,
+    DOCS / "getting-started.md",
+    DOCS / "reference" / "environments.md",
+    *sorted(DOCS.glob("tutorials/*.md")),
+    *sorted(DOCS.glob("how-to/*.md")),
+]
+_FETCHED = re.compile(r"<(?:script|img|link rel=.stylesheet.)[^>]+(?:src|href)=.(https?://[^\"']+)")
+_TABLE = re.compile(r"(?:^\|.*\|\n)+", re.MULTILINE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", TYPED, ids=lambda page: page.stem)
+def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tests.documents", str(page)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+
+
+def test_pages_that_are_run_have_something_to_run() -> None:
+    with_blocks = [page for page in TYPED if any(block.language != "text" for block in blocks(page))]
+    assert len(with_blocks) > 12
+    assert set(DOCS.glob("tutorials/*.md")) <= set(with_blocks)
+
+
+@pytest.mark.parametrize(
+    ("block", "message"),
+    [
+        ("```bash\nexit 3\n```\n", "exit code 3"),
+        ("```python\nprint('one')\n```\n\n```text\ntwo\n```\n", "what came out is"),
+        ("```python\n1 / 0\n```\n", "ZeroDivisionError"),
+    ],
+)
+def test_a_page_that_does_not_work_is_found(block: str, message: str, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(block)
+    command = [sys.executable, "-m", "tests.documents", str(page)]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert message in result.stderr
+
+
+def test_the_site_is_built_without_warnings(tmp_path: Path) -> None:
+    """``make docs`` says --strict, too: a warning is an error there."""
+    beside_python = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    environment = os.environ | {"PATH": beside_python, "NO_MKDOCS_2_WARNING": "1"}
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    pages = {page.relative_to(DOCS).with_suffix(".html") for page in DOCS.rglob("*.md")}
+    assert all((tmp_path / "site" / page).exists() for page in pages)
+    commands = (tmp_path / "site" / "reference" / "commands.html").read_text(encoding="utf-8")
+    assert "--p-conservative" in commands
+    site = (tmp_path / "site").rglob("*.html")
+    assert not [url for page in site for url in _FETCHED.findall(page.read_text())]  # it is read without a network
+
+
+def test_the_readme_is_short() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150
+    assert len(text.split()) <= 1000
+
+
+@pytest.mark.parametrize(
+    ("page", "head"),
+    [
+        (README, "| method | seeds | P 0.1"),
+        (DOCS / "results" / "index.md", "| method | seeds | P 0.1"),
+        (DOCS / "explanation" / "when-traits-help.md", "| method | as trained |"),
+    ],
+    ids=("README", "results", "when-traits-help"),
+)
+def test_tables_are_those_of_the_results(page: Path, head: str) -> None:
+    measured = _tables(ROOT / "data" / "results" / "navigation.md")
+    shown = [table for table in _tables(page) if table.startswith(head)]
+    assert len(shown) == 1
+    assert shown[0] in measured
+
+
+def _tables(page: Path) -> list[str]:
+    """The tables of a page, with single spaces."""
+    text = re.sub(r" +", " ", page.read_text(encoding="utf-8"))
+    return [re.sub(r"-{3,}", "---", table) for table in _TABLE.findall(text)]

@@ -16,7 +16,7 @@ ENV_IDS = {
     "roundabout": "tint_sumo/Roundabout-v0",
     "on_ramp": "tint_sumo/OnRamp-v0",
 }
-SCENE_ENV_ID = "tint_sumo/Scene-v0"  # of any scene, given as ``scene``
+SCENE_ENV_ID = "tint_sumo/Scene-v0"  # the environment of any scene, which is given as ``scene``
 
 
 def _register(env_id: str, **scene: str) -> None:

@@ -44,7 +44,7 @@ def told(work: Callable[[], Any]) -> Told:
         return "done", work()
     except InputError as error:
         return "refused", str(error)
-    except (EOFError, ConnectionError):  # nobody is at the other end any more
+    except (EOFError, ConnectionError):  # the other end is closed
         raise
     except Exception:
         return "failed", traceback.format_exc()

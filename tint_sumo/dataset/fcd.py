@@ -75,7 +75,7 @@ def _vehicles(rows: pd.DataFrame, layout: Layout) -> list[str]:
         _decimals(rows["speed_mps"].to_numpy(np.float64)),
         _decimals(front_m - starts_m[route, stage]),
         lanes[route, stage],
-        _decimals(rows["acceleration_mps2"].fillna(0.0).to_numpy(np.float64)),  # as SUMO has it at appearance
+        _decimals(rows["acceleration_mps2"].fillna(0.0).to_numpy(np.float64)),  # SUMO writes 0 when a vehicle appears
     )
     return [
         f'        <vehicle id="{episode}.{number}" x="{x}" y="{y}" angle="{angle}" type="{VEHICLE_TYPE}" '

@@ -17,7 +17,7 @@ import pandas as pd
 
 from tint_sumo.errors import InputError
 
-_NAMES = {  # of the columns in SUMO's tables
+_NAMES = {  # names of the columns in SUMO's tables
     "timestep_time": "time_s",
     "vehicle_id": "vehicle",
     "vehicle_lane": "lane",

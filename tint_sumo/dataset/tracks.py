@@ -88,7 +88,7 @@ def _driven(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None) ->
     moved_m = np.where(along_lane, moved_m, np.nan)
     by_speed_m = (rows["speed_mps"] * rows["time_s"].diff()).to_numpy()
     displacement_m = np.fmin(np.fmax(by_speed_m, moved_m - _POS_DIGIT_M), moved_m + _POS_DIGIT_M)
-    displacement_m[0] = 0.0  # where another vehicle starts no difference counts
+    displacement_m[0] = 0.0  # a difference to another vehicle's position means nothing
     return rows[["vehicle", "time_s", "gap_m"]].assign(position_m=np.cumsum(displacement_m))
 
 

@@ -25,7 +25,7 @@ from tint_sumo.processes import SPAWN, answer, start_worker, told
 from tint_sumo.simulation.connection import libsumo_is_free
 
 _ENDING_S = 10.0  # more than enough for a step, and to close a simulation
-_LOOK_OUT_S = 1e-3  # about a step; to be put to sleep and woken up again costs a good part of one
+_LOOK_OUT_S = 1e-3  # about the time of a step; sleeping and waking up would cost a large part of it
 _INTEGER = np.dtype(np.int64)
 
 
@@ -85,7 +85,7 @@ class WorkerBatch:
             raise RuntimeError("the environment is closed; make a new one")
         try:
             for helper in self._helpers:
-                with suppress(ConnectionError):  # one that has died is found out when it is listened to
+                with suppress(ConnectionError):  # a worker that has died is noticed at the next answer
                     helper.line.send((request, *arguments(helper.share)))
             own = [] if self._local is None else [getattr(self._local, request)(*arguments(self._shares[0]))]
             return own + self._listen()
@@ -124,7 +124,7 @@ def _start(worker: int, shared: "_Shared", share: slice, settings: TaskSettings)
 
 def _end(helpers: list[_Helper]) -> None:
     for helper in helpers:
-        helper.line.close()  # it ends when nobody is at the other end
+        helper.line.close()  # it ends when the other end is closed
     for helper in helpers:
         helper.process.join(_ENDING_S)
         helper.process.kill()
@@ -184,7 +184,7 @@ class _Line:
 def _serve(pipe: Connection, shared: _Shared, worker: int, share: slice, settings: TaskSettings) -> None:
     """A worker process."""
     line = _Line(pipe, shared.sent[worker, ::-1])
-    with suppress(EOFError, ConnectionError):  # nobody is at the other end any more
+    with suppress(EOFError, ConnectionError):  # the other end is closed
         line.send(told(lambda: _answer_requests(line, shared, share, settings)))
 
 

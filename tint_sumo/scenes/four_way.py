@@ -8,7 +8,7 @@ from tint_sumo.scenes.parts import AHEAD_ONLY, OVERHANG_M, arc
 from tint_sumo.scenes.scene import EgoTask, Route, Scene, View, register
 
 _END_M, _MINOR_END_M = 20.0 + OVERHANG_M, 25.0
-_WEST_M, _EAST_M, _SOUTH_M, _NORTH_M = -4.0, 8.0, -4.0, 4.0  # of the junction
+_WEST_M, _EAST_M, _SOUTH_M, _NORTH_M = -4.0, 8.0, -4.0, 4.0  # borders of the junction
 _EASTBOUND_Y_M, _WESTBOUND_Y_M, _NORTHBOUND_X_M = -2.0, 2.0, 2.0
 _MAIN, _MINOR = 3, 1  # priorities
 _TURN_RADIUS_M = 6.0

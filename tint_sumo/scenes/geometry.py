@@ -21,7 +21,7 @@ SPACING_M = 0.02  # a chord of a circle of 6 m lies within 0.01 mm of it
 
 # A box's centre and unit heading.
 POSE = np.dtype([(part, np.float64) for part in ("x_m", "y_m", "heading_x", "heading_y")])
-Poses = NDArray[np.void]  # of POSE
+Poses = NDArray[np.void]  # records of POSE
 
 
 def resample(points: Floats, length_m: float) -> Floats:
@@ -239,7 +239,7 @@ def measure_distances_m(
         length_m, width_m: of every box.
         distance_m: (R, V) written; infinite for empty slots.
     """
-    radius_m = math.hypot(length_m, width_m) / 2  # of a box, however it stands
+    radius_m = math.hypot(length_m, width_m) / 2  # of the circle around a box
     for row in range(len(egos)):
         ego = egos[row]
         for slot in range(present.shape[1]):

@@ -16,7 +16,7 @@ from tint_sumo.errors import InputError
 
 Point = tuple[float, float]  # x and y in m
 
-REPLICA_SPACING_M = 128.0  # for people to look at
+REPLICA_SPACING_M = 128.0  # wide enough for people to tell replicas apart
 REPLICAS_PER_ROW = 16
 _NETCONVERT_OPTIONS = (
     "--no-turnarounds",
@@ -34,7 +34,7 @@ class Node:
     id: str
     x_m: float
     y_m: float
-    shape: tuple[Point, ...] = ()  # the junction's outline; netconvert's own if not given
+    shape: tuple[Point, ...] = ()  # outline of the junction; netconvert chooses one if it is not given
     type: str = "priority"  # or dead_end. Never unregulated: SUMO then knows neither reactions nor collisions.
 
 
@@ -55,7 +55,7 @@ class Connection:
 
     start: str  # edge
     end: str
-    shape: tuple[Point, ...] = ()  # of the lane on the junction; netconvert's own if not given
+    shape: tuple[Point, ...] = ()  # shape of the lane on the junction; netconvert chooses one if it is not given
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class _Replica:
         )
 
     def connection(self, one: Connection) -> str:
-        # With a place to wait in the middle of a junction its lane would be two.
+        # A place to wait in the middle of a junction would split its lane in two.
         lanes = 'fromLane="0" toLane="0" contPos="0"'
         return f"<connection {self._ends(one.start, one.end)} {lanes}{self._shape(one.shape)}/>"
 

@@ -5,7 +5,7 @@ import math
 from tint_sumo.config import EgoController, VehicleShape
 from tint_sumo.scenes.network import Point
 
-OVERHANG_M = VehicleShape().length_m / 2  # of traffic's lanes past the modelled roads, where centres are
+OVERHANG_M = VehicleShape().length_m / 2  # traffic lanes reach this far past the roads, on which vehicle centres lie
 _DEGREES_PER_POINT = 4.0
 
 # Where roads part, a driver that waits behind the ego can stand so close to its side that the two would wait for each

@@ -16,17 +16,17 @@ from tint_sumo.scenes.parts import mirrored_x
 from tint_sumo.scenes.scene import EgoTask, Route, Scene, View, register
 
 _LENGTH_M = VehicleShape().length_m
-_HALF_LENGTH_M = 20.0  # of the street: vehicle centres lie in [-20, 20] (code)
+_HALF_LENGTH_M = 20.0  # the street's: vehicle centres lie in [-20, 20] (code)
 _LANE_WIDTH_M = 4.0  # code
 _LOWER_Y_M, _BORDER_Y_M, _UPPER_Y_M = 2.0, 4.0, 6.0  # westbound lane, border, eastbound lane; y = 0 is the stem's end
 _JUNCTION_HALF_LENGTH_M = 6.0
 _STEM_LENGTH_M = 20.0
-_TURN_RADIUS_M = 6.0  # of the centre's quarter circle from (0, 0) to (6, 6) (code)
-_START_Y_M = -5.0  # of the ego's centre, at x = 0 (code)
-_GOAL_X_M = 8.0  # of the ego's centre, on the upper lane (code)
+_TURN_RADIUS_M = 6.0  # the ego's centre follows a quarter circle from (0, 0) to (6, 6) (code)
+_START_Y_M = -5.0  # the ego's centre starts there, at x = 0 (code)
+_GOAL_X_M = 8.0  # the ego's centre reaches its goal there, on the upper lane (code)
 _HALF_LINK_M = 0.06
 _TURN_POINTS = 16
-_WAY_POINTS = 1024  # on the arc
+_WAY_POINTS = 1024  # points along the arc
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class _Turn:
     centre. The ego's centre then stays within 0.3 m of its path.
     """
 
-    radius_m: float = math.hypot(_TURN_RADIUS_M, _LENGTH_M / 2)  # of the front's arc
+    radius_m: float = math.hypot(_TURN_RADIUS_M, _LENGTH_M / 2)  # radius of the arc that the front follows
     start_m: float = _STEM_LENGTH_M + _LENGTH_M / 2
 
     @property

@@ -37,7 +37,7 @@ class DriverPool:
         self.population = population
         self.scene = layout.scene
         everybody = list(range(len(population)))
-        self.by_trait = {  # where all are alike, each share is drawn from all
+        self.by_trait = {  # where all drivers yield, or none does, all are drawn from
             yields: [index for index in everybody if population[index].profile.yields is yields] or everybody
             for yields in (True, False)
         }

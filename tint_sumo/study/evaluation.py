@@ -27,9 +27,9 @@ class Case:
     """How one episode went."""
 
     outcome: str  # success, timeout or collision
-    time_s: float  # when it ended
-    trait: str | None = None  # of the driver that was hit
-    route: str | None = None  # of that driver
+    time_s: float  # time of its end
+    trait: str | None = None  # trait of the driver that was hit
+    route: str | None = None  # route of that driver
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from tint_sumo.study.methods import METHODS
 from tint_sumo.study.rows import Row
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
-INK = {"success": "white", "timeout": "black", "collision": "white"}  # of the numbers on these colours
+INK = {"success": "white", "timeout": "black", "collision": "white"}  # colours of the numbers on these colours
 _MARKERS = "osD^vP*Xh<>"
-_PANELS = 3  # in a row
+_PANELS = 3  # panels in a row
 
 
 def plot_bars(rows: Sequence[Row], file: Path) -> Path:

@@ -12,7 +12,7 @@ from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import Case, Evaluation
 
 RESULTS = "results"  # folder of the results in a study's folder
-TRAINED, GIVEN = "trained", "given"  # where a policy comes from: the study itself, or a rule or the package
+TRAINED, GIVEN = "trained", "given"  # origin of a policy: the study itself, or a rule or the package
 
 
 @dataclass(frozen=True)

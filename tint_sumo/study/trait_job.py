@@ -13,7 +13,7 @@ from tint_sumo.study.trait_models import evaluate_traits, plot_traits, train_tra
 from tint_sumo.traits.storage import add_to_card
 
 DATASET = "dataset"  # folder of the dataset in a study's folder
-SEED = 0  # of the dataset and of the trait models
+SEED = 0  # seed of the dataset and of the trait models
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class TraitJob:
 
     method: str
     settings: TraitSettings
-    out: Path  # of the study
+    out: Path  # folder of the study
 
     @property
     def name(self) -> str:

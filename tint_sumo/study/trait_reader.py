@@ -11,10 +11,10 @@ from tint_sumo.policy.trait_sources import StreamingTraits
 from tint_sumo.scenes.geometry import Floats
 from tint_sumo.study.loading import Contender
 
-_ENVS, _STEPS = 8, 200  # of the traffic that is looked at
+_ENVS, _STEPS = 8, 200  # environments and steps of the traffic that is looked at
 _EVERY = 5  # steps: neighbouring ones say the same
 _P_CONSERVATIVE = 0.5
-_WAIT = 0  # the ego's action meanwhile
+_WAIT = 0  # action of the ego in that traffic
 _PROBIT = math.pi / 8  # how the uncertainty of an input flattens a logistic function (MacKay 1992)
 
 

@@ -15,7 +15,7 @@ class WindowBatch:
 
     states: Tensor  # (N, T, 2) m: offset and gap
     length: Tensor  # (N,)
-    other: "WindowBatch | None" = None  # of each window's driver another window, or the same one if it has only one
+    other: "WindowBatch | None" = None  # another window of each window's driver, or the same one if there is no other
     conservative: Tensor | None = None  # (N,) bool, for methods that are trained with labels
 
     def with_noise(self, noise_m: float, generator: torch.Generator) -> "WindowBatch":
@@ -53,8 +53,8 @@ class Siblings:
         self._sorted = torch.argsort(driver, stable=True)  # windows, driver by driver
         _, inverse, count = torch.unique(driver, return_inverse=True, return_counts=True)
         self._count = count[inverse]
-        self._first = (count.cumsum(0) - count)[inverse]  # where a driver's windows begin
-        self._rank = torch.empty_like(self._sorted)  # of a window among those of its driver
+        self._first = (count.cumsum(0) - count)[inverse]  # position of a driver's first window
+        self._rank = torch.empty_like(self._sorted)  # number of a window among those of its driver
         self._rank[self._sorted] = torch.arange(len(driver))
         self._rank -= self._first
 

@@ -12,8 +12,8 @@ from tint_sumo.traits.encoder import kl_divergence, sample
 from tint_sumo.traits.model import FEATURES, TraitModel, register, valid_steps
 
 SAMPLES = 8  # latents per window in the estimate of the predictive likelihood
-KL_WEIGHT = 0.01  # holds the latents near the standard normal prior, and hardly more
-LOG_STD_RANGE = (-4.0, 3.0)  # of predicted features; a perfect prediction is no denser than exp(4)
+KL_WEIGHT = 0.01  # just enough to keep the latents near the standard normal prior
+LOG_STD_RANGE = (-4.0, 3.0)  # limits for predicted features: the density of a perfect prediction stays below exp(4)
 
 
 @register

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from tint_sumo.config import TraitSettings
 
-INITIAL_LOG_VAR = -4.0  # of the latent: noise as wide as the prior would drown the means while they take shape
+INITIAL_LOG_VAR = -4.0  # starts small: noise as wide as the prior would hide the means while they are learnt
 
 
 class WindowEncoder(nn.Module):

@@ -36,8 +36,8 @@ class Part:
 class TraitAccuracy:
     """How well the latent mean tells the traits apart, on windows of unseen episodes."""
 
-    accuracy: float  # of a linear support vector classifier
-    knn_accuracy: float  # of the nearest neighbours in the latent space
+    accuracy: float  # share of windows that a linear support vector classifier gets right
+    knn_accuracy: float  # the same of the nearest neighbours in the latent space
     windows: int
     error_m: float | None  # root mean square of reconstructed or predicted positions; None if the method has none
     # Share of the linear classifier's errors; None without errors or with point estimates.

@@ -16,7 +16,7 @@ from tint_sumo.traits.evaluation import encode_windows
 from tint_sumo.traits.model import TraitModel
 from tint_sumo.traits.vae import Vae
 
-DRAWN_WINDOWS = 5000  # more would hide each other
+DRAWN_WINDOWS = 5000  # more windows would hide each other
 NUMBERED = 10  # windows whose trajectories are shown
 LEADER_COLOUR = (0.55, 0.35, 0.17)
 _RECONSTRUCTED = 6

@@ -9,7 +9,7 @@ from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import kl_divergence, perceptron, sample
 from tint_sumo.traits.model import FEATURES, TraitModel, register, valid_steps
 
-START_OF_SEQUENCE = -2.0  # of both features (code)
+START_OF_SEQUENCE = -2.0  # value of both features before the first step (code)
 
 
 @register

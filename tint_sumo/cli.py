@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -29,6 +30,7 @@ from tint_sumo.configuration import (
     write_command,
 )
 from tint_sumo.errors import InputError
+from tint_sumo.provenance import Origin, made_by
 from tint_sumo.structures import Where
 
 if TYPE_CHECKING:
@@ -655,7 +657,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if command.print_config:
             print(write_command(command), end="")
             return 0
-        outcome = command.run()
+        with made_by(Origin(tuple(words), partial(write_command, command))):
+            outcome = command.run()
     except InputError as error:
         print(f"tint-sumo: error: {error}", file=sys.stderr)
         return 2

@@ -18,6 +18,7 @@ from tint_sumo.policy.storage import card_file, load_policy_network, read_policy
 from tint_sumo.policy.venv import policy_venv
 from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnScene, find_scene, read_described
 from tint_sumo.study.methods import METHODS, Learned, Policy, Rule, find_learned
+from tint_sumo.study.rules import ACTIONS as RULE_ACTIONS
 from tint_sumo.study.training import POLICY, TRAITS, digest
 from tint_sumo.traits import TraitModel
 
@@ -90,10 +91,24 @@ def load_policy(name_or_path: str | Path, *, scene: AnyScene | None = None, allo
 
 
 def _in_scene(contender: Contender, scene: AnyScene) -> Contender:
-    """The policy in another scene, if there is one of that name."""
+    """The policy in another scene.
+
+    Raises:
+        InputError: there is no such scene, or it has other numbers of observed vehicles or of actions.
+    """
+    found = find_scene(scene)
+    network: Any = contender.policy
+    is_rule = contender.source is None
+    vehicles = found.max_vehicles if is_rule else network.observation_space["vehicles"].shape[0]
+    actions = RULE_ACTIONS if is_rule else network.action_space.n
+    for what, wanted, there in (
+        ("max_vehicles", vehicles, found.max_vehicles),
+        ("desired_speeds_mps", actions, len(found.ego.controller.desired_speeds_mps)),
+    ):
+        if wanted != there:
+            raise InputError(f"policy {contender.name} needs {what} of {wanted}, and scene {found.name} has {there}")
     trained_for = DEFAULT_P_CONSERVATIVE if contender.p_conservative is None else contender.p_conservative
-    is_own = isinstance(find_scene(scene), OwnScene)
-    return replace(contender, scene=scene, p_conservative=None if is_own else trained_for)
+    return replace(contender, scene=scene, p_conservative=None if isinstance(found, OwnScene) else trained_for)
 
 
 def _require_same_roads(stem: Path, found: Contender) -> None:

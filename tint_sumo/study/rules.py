@@ -15,7 +15,8 @@ from tint_sumo.scenes.layout import Layout, layout
 Observation = dict[str, NDArray[np.float32]]
 State = tuple[NDArray[np.float64], ...]
 
-STOP, CREEP, GO = 0, 1, 2  # actions: desired speeds of 0, 0.5 and 3 m/s
+STOP, CREEP, GO = 0, 1, 2  # actions: desired speeds of 0, 0.5 and 3 m/s in the built-in scenes
+ACTIONS = 3
 
 
 class AlwaysGo:

@@ -3,12 +3,10 @@
 import csv
 import hashlib
 import io
-import platform
 import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +26,7 @@ from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy
 from tint_sumo.policy.venv import policy_venv
 from tint_sumo.progress import Report, silent
+from tint_sumo.provenance import versions
 from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnScene, described, find_scene
 from tint_sumo.study.budgets import SNAPSHOTS_PERCENT
 from tint_sumo.study.evaluation import CASE_SEED, require_seed
@@ -110,7 +109,7 @@ def train_policy(
         "traits": None if encoder is None else digest(encoder),
     }
     stem = snapshot_stem(out, 100)
-    with claim_folder(out, identity):
+    with claim_folder(out, identity, with_versions=False):  # the card has them
         if with_zip and card_file(stem).exists() and not (out / ZIP_FILE).exists():
             raise InputError(f"{out} holds a finished run without {ZIP_FILE}; train into another folder to have one")
         if not card_file(stem).exists():
@@ -347,5 +346,5 @@ def _card(identity: Mapping[str, Any], encoder: TraitModel | None) -> dict[str, 
     return {
         **{key: value for key, value in identity.items() if key != "kind"},
         **_traits_entries(encoder),
-        "versions": {name: version(name) for name in packages} | {"python": platform.python_version()},
+        "versions": versions(packages),
     }

@@ -1,12 +1,14 @@
 """The ``tint-sumo`` command. Each command is a dataclass whose fields are its flags."""
 
+import io
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
 
 import tyro
 from tyro.conf import (
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
 
 ShareFlag = tuple[float, ...]  # one probability, or the two ends of a range
 _SCENES = ", ".join(ENV_IDS)
+Shell = Literal["bash", "zsh", "tcsh"]
+_TYRO = (OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff)
 RESUMES = ", the same command goes on from here"
 
 
@@ -631,9 +635,9 @@ class Study:
 class TintSumo:
     """Driving among strangers: driver-trait inference and intersection navigation on Eclipse SUMO."""
 
-    print_completion: Literal["bash", "zsh", "tcsh"] | None = None
-    """Print a script that completes commands and flags in that shell, for bash to be read with
-    eval "$(tint-sumo --print-completion bash)"."""
+    print_completion: Shell | None = None
+    """Print a script that completes commands and flags in that shell, and do nothing else. For bash, put this line into
+    ~/.bashrc: eval "$(tint-sumo --print-completion bash)"."""
 
     command: (
         Annotated[Net, subcommand("net")]
@@ -651,6 +655,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit code is 0, 2 after bad input, or 130 after an interruption."""
     words = list(sys.argv[1:] if argv is None else argv)
     after_interrupt = Command.after_interrupt
+    if words[:1] == ["--print-completion"] and words[1:] in ([shell] for shell in get_args(Shell)):
+        print(_completion_script(words[1]), end="")
+        return 0
     try:
         command = parse(words)
         after_interrupt = command.after_interrupt
@@ -682,21 +689,29 @@ def parse(words: list[str]) -> Command:
     Raises:
         InputError: the file is not there, or a value in it does not fit.
     """
-    if words[:1] == ["--print-completion"]:
-        words = ["--tyro-print-completion", *words[1:]]
-    config = [OmitArgPrefixes, OmitSubcommandPrefixes]
     file = config_of(words)
     *groups, kind = commands_named(TintSumo, words)
     if file is None or not issubclass(kind, Command):
-        parsed: Any = tyro.cli(TintSumo, prog="tint-sumo", args=words, config=[*config, FlagCreatePairsOff])
+        parsed: Any = tyro.cli(TintSumo, prog="tint-sumo", args=words, config=_TYRO)
     else:
         default: Any = read_command(kind, file)
         for group in reversed(groups):
             default = group(command=default)
-        parsed = tyro.cli(TintSumo, prog="tint-sumo", args=words, default=default, config=config)
+        with_pairs = [one for one in _TYRO if one is not FlagCreatePairsOff]  # --no-json where the file has json: true
+        parsed = tyro.cli(TintSumo, prog="tint-sumo", args=words, default=default, config=with_pairs)
     while not isinstance(parsed, Command):
         parsed = parsed.command
     return parsed
+
+
+def _completion_script(shell: str) -> str:
+    """A script that a shell reads; it holds all commands and flags, and does not need this package."""
+    script = io.StringIO()
+    with redirect_stdout(script), suppress(SystemExit):
+        tyro.cli(TintSumo, prog="tint-sumo", args=["--tyro-print-completion", shell], config=_TYRO)
+    # The script offers each line of a help text as a word of its own.
+    lines = script.getvalue().splitlines(keepends=True)
+    return "".join(one.replace("\\n", " ") if one.startswith("COMPLETION_SPEC") else one for one in lines)
 
 
 def _world(

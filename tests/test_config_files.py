@@ -1,16 +1,23 @@
 """Configuration files: what commands read from them, and what they print."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.scenes.own_networks import OwnNetwork
 from tint_sumo.cli import TintSumo, main, parse
 from tint_sumo.configuration import commands_named, subcommands
+from tint_sumo.dataset.windows import load_drivers, load_labels, load_windows
+from tint_sumo.errors import InputError
+from tint_sumo.scenes import Scene, read_scene
 from tint_sumo.study.budgets import BUDGETS
+from tint_sumo.study.ceiling_job import CeilingJob
+from tint_sumo.study.grid import plan, run_study
+from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
 
 # A command line for each command, with as many flags as it has kinds of values.
 COMMAND_LINES = (
@@ -41,8 +48,8 @@ def printed(capsys: pytest.CaptureFixture[str], *words: Any) -> str:
     return capsys.readouterr().out
 
 
-def written(folder: Path, text: str) -> Path:
-    file = folder / "config.yaml"
+def written(folder: Path, text: str, name: str = "config.yaml") -> Path:
+    file = folder / name
     file.write_text(text, encoding="utf-8")
     return file
 
@@ -206,3 +213,117 @@ def test_missing_and_unreadable_files(tmp_path: Path, capsys: pytest.CaptureFixt
     (tmp_path / "binary.yaml").write_bytes(b"\xff\x00")
     assert "is not a readable text file" in refused(capsys, "bench", "--config", tmp_path / "binary.yaml")
     assert "is not a readable text file" in refused(capsys, "bench", "--config", tmp_path)
+
+
+# What can be defined there
+
+DRIVERS = """
+population:
+- {name: shy, desired_speed_mps: [1.5, 2], min_gap_m: [2, 3], entry_gap_m: [6, 8], yields: true, colour: "0,0,200"}
+- {name: calm, desired_speed_mps: [2, 3], min_gap_m: [1, 2], entry_gap_m: [4, 6], yields: true, colour: "0,200,0"}
+- {name: bold, desired_speed_mps: [3, 4], min_gap_m: [0.2, 0.5], entry_gap_m: [3, 5], yields: false, colour: "200,0,0"}
+"""
+SMALL = "budget: {n_envs: 2, n_steps: 8, n_minibatches: 1}\nsteps: 1\nout: run\n"
+
+
+def test_drivers_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "data"
+    manifest = ran(capsys, "record", "--config", written(tmp_path, DRIVERS), "--windows", 20, "--out", out)
+    assert [profile["name"] for profile in manifest["population"]["profiles"]] == ["shy", "calm", "bold"]
+    windows = load_windows(out)
+    names = load_drivers(out, windows, ["trait"])["trait"]
+    assert set(names) == {"shy", "calm", "bold"}
+    assert [("shy", "calm", "bold")[label] for label in load_labels(out, windows)] == list(names)
+    found = ran(capsys, "dataset", "inspect", out)["traits"]
+    assert found["shy"]["speed_mps"]["max"] <= 2.0 < found["bold"]["speed_mps"]["max"]
+    assert "holds another run (different: population)" in refused(capsys, "record", "--windows", 20, "--out", out)
+
+
+def test_a_trait_model_of_another_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = written(tmp_path, "scene: {claim: {braking_mps2: 4}, name: hasty}")
+    out = tmp_path / "data"
+    assert ran(capsys, "record", "--config", scene, "--windows", 20, "--out", out)["scene"] == "hasty"
+    message = "trait model vae was trained in scene t_intersection"
+    assert message in refused(capsys, "traits", "evaluate", "--data", out, "--model", "vae")
+    train = written(tmp_path, f"method: vae\n{SMALL}{scene.read_text()}", "train.yaml")
+    argv = ("policy", "train", "--config", train, "--out", tmp_path / "run")
+    assert "the policy is of scene hasty" in refused(capsys, *argv)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_policy_drives_in_the_scene_that_it_was_trained_in(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene = "scene: {base: four_way, name: small, max_vehicles: 4, time_limit_s: 2, population: {idm: {tau_s: 2}}}"
+    file = written(tmp_path, f"method: oracle\n{SMALL}{scene}")
+    ran(capsys, "policy", "train", "--config", file)
+    found = ran(capsys, "policy", "evaluate", "--model", "run", "--episodes", 2)
+    assert (found["scene"], found["tau_s"]) == ("small", 2.0)
+    message = "policy run needs max_vehicles of 4, and scene four_way has 12"
+    assert message in refused(capsys, "policy", "evaluate", "--model", "run", "--scene", "four_way")
+    written(tmp_path, scene)
+    found = ran(capsys, "policy", "evaluate", "--model", "always_go", "--config", file, "--episodes", 2)
+    assert (found["scene"], found["timeout"]) == ("small", 1.0)
+    assert ran(capsys, "render", "--model", "run", "--out", "film.png")["time_s"] == 2.0
+    assert ran(capsys, "render", "--model", "ttc", "--config", file, "--out", "other.png")["scene"] == "small"
+
+
+def test_policies_and_films_of_other_drivers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene = "scene:\n  name: three\n  time_limit_s: 1\n" + DRIVERS.replace("\n", "\n  ")
+    file = written(tmp_path, SMALL + scene)
+    message = "method oracle is told which of two kinds of drivers each one is of, and scene three has 3"
+    assert message in refused(capsys, "policy", "train", "--method", "oracle", "--config", file)
+    ran(capsys, "policy", "train", "--method", "no_labels", "--config", file)
+    assert "a film shows drivers of two profiles" in refused(capsys, "render", "--model", "run", "--out", "film.png")
+    study = ("study", "run", "--config", written(tmp_path, scene), "--out", "study")
+    assert "a study is of two profiles of drivers, and scene three has 3" in refused(capsys, *study)
+    assert not Path("study").exists()
+
+
+def test_a_sumo_configuration_as_a_scene(
+    own_network: Callable[[str], OwnNetwork],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    merge = own_network("merge")
+    scene = (
+        f"scene:\n  sumocfg: {merge.sumocfg}\n  ego_route: [ramp, out]\n  start_m: 20\n  goal_m: 130\n"
+        "  warm_up_s: 1\n  time_limit_s: 1\n"
+    )
+    file = written(tmp_path, scene)
+    manifest = ran(capsys, "record", "--config", file, "--windows", 20, "--out", "data")
+    assert manifest["population"] == ["calm", "hasty"]
+    argv = ("record", "--config", file, "--population", "traits", "--out", "other")
+    assert "--population does not go with the sumocfg of a scene" in refused(capsys, *argv)
+    one = SMALL.replace("n_envs: 2", "n_envs: 1")  # each has a process of its own
+    train = written(tmp_path, one + scene, "train.yaml")
+    ran(capsys, "policy", "train", "--method", "oracle", "--config", train)
+    found = ran(capsys, "policy", "evaluate", "--model", "run", "--episodes", 1)
+    assert (found["scene"], found["p_conservative"], found["timeout"]) == ("merge", None, 1.0)
+    argv = ("policy", "train", "--method", "oracle", "--config", train, "--out", "new", "--p-conservative", 0.2)
+    assert "leave p_conservative out" in refused(capsys, *argv)
+    evaluation = ("policy", "evaluate", "--episodes", 1, "--model")
+    assert "leave p_conservative and tau_s out" in refused(capsys, *evaluation, "run", "--tau", 2)
+    assert "ttc needs the conflict zones" in refused(capsys, *evaluation, "ttc", "--config", file)
+    assert "films show built-in scenes only" in refused(capsys, "render", "--model", "run", "--out", "film.gif")
+    assert "a study needs a built-in scene" in refused(capsys, "study", "run", "--out", "study", "--config", file)
+    assert "scene merge has SUMO's files already" in refused(capsys, "net", "--config", file)
+
+
+def test_all_of_a_study_is_in_its_scene(tmp_path: Path) -> None:
+    scene = read_scene({"base": "four_way", "time_limit_s": 20})
+    assert isinstance(scene, Scene)
+    budget = replace(BUDGETS["quick"], methods=("ttc", "oracle"))
+    jobs = plan(budget, tmp_path, scene)
+    placed = [job.scene for job in jobs if isinstance(job, TrainJob | EvaluateJob | CeilingJob)]
+    assert placed == [scene] * len(jobs)
+    assert not any("shipped" in job.name for job in jobs)  # they know another scene
+    with pytest.raises(InputError, match="the shipped trait models know the scene t_intersection, not four_way-"):
+        run_study(replace(budget, traits=None), tmp_path / "out", scene=scene, progress=False)
+    assert not (tmp_path / "out").exists()

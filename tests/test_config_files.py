@@ -128,6 +128,13 @@ def test_an_empty_file_and_numbers_with_exponents(tmp_path: Path) -> None:
     assert found == replace(BUDGETS["full"].ppo, learning_rate=0.001, n_envs=8)
 
 
+def test_one_value_stands_for_a_list_of_it(tmp_path: Path) -> None:
+    text = "p_conservative: 0.4\nbudget: {seeds: 3, methods: oracle, mixes: [0.5, [0.1, 0.9]]}"
+    assert parse(["record", "--out", "x", "--config", str(written(tmp_path, text[:20]))]).p_conservative == (0.4,)
+    budget = parse(["study", "run", "--config", str(written(tmp_path, text[20:]))]).budget
+    assert (budget.seeds, budget.methods, budget.mixes) == ((3,), ("oracle",), (0.5, (0.1, 0.9)))
+
+
 def test_a_budget_equal_to_a_known_one_is_that_one(tmp_path: Path) -> None:
     assert parse(["study", "run", "--config", str(written(tmp_path, "budget: {base: full}"))]).budget == "full"
     other = parse(["study", "run", "--config", str(written(tmp_path, "budget: {seeds: [4]}"))]).budget
@@ -147,7 +154,7 @@ def test_a_budget_equal_to_a_known_one_is_that_one(tmp_path: Path) -> None:
         ("record", "windows: true", "line 1: windows: must be a whole number, not True"),
         ("record", "out: null", "line 1: out: must be a path, not None"),
         ("record", "format: xml", "line 1: format: must be one of parquet, fcd, not 'xml'"),
-        ("record", "p_conservative: 0.4", "line 1: p_conservative: must be a list, each item a number, not 0.4"),
+        ("record", "p_conservative: x", "line 1: p_conservative: must be a list, each item a number, not 'x'"),
         ("record", "p_conservative:\n- 0.1\n- x", "line 3: p_conservative[1]: must be a number, not 'x'"),
         ("record", "seed: 1\nout: a\nseed: 2", "line 3: seed is said twice"),
         ("record", "seed: [", "line 1: not YAML ("),

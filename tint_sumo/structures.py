@@ -152,7 +152,7 @@ def _has_shape(kind: Any, value: Any) -> bool:
     if is_dataclass(kind):
         return isinstance(value, Mapping)
     if get_origin(kind) is tuple:
-        return isinstance(value, list | tuple)
+        return isinstance(value, list | tuple) or (_is_variadic(kind) and _has_shape(get_args(kind)[0], value))
     if get_origin(kind) is Literal:
         return value in get_args(kind) and not isinstance(value, bool)
     if isinstance(value, bool):
@@ -162,11 +162,16 @@ def _has_shape(kind: Any, value: Any) -> bool:
     return isinstance(value, str | Path if kind is Path else kind)
 
 
-def _items(kind: Any, value: Sequence[Any], where: Where) -> list[tuple[Any, Any]]:
-    """The items of a tuple, each with its type."""
+def _is_variadic(kind: Any) -> bool:
+    """Whether a tuple's type is that of any number of items."""
+    return get_args(kind)[-1] is ...
+
+
+def _items(kind: Any, value: Any, where: Where) -> list[tuple[Any, Any]]:
+    """The items of a tuple, each with its type; where there may be any number of them, one needs no list."""
     kinds = get_args(kind)
-    if len(kinds) == 2 and kinds[1] is ...:
-        return [(kinds[0], one) for one in value]
+    if _is_variadic(kind):
+        return [(kinds[0], one) for one in (value if isinstance(value, list | tuple) else [value])]
     if len(value) != len(kinds):
         _refuse(kind, value, where)
     return list(zip(kinds, value, strict=True))
@@ -184,7 +189,7 @@ def _words(kind: Any) -> str:
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(str, arguments))}"
     if get_origin(kind) is tuple:
-        count = "" if arguments[-1] is ... else f" of {len(arguments)}"
+        count = "" if _is_variadic(kind) else f" of {len(arguments)}"
         return f"a list{count}, each item {_words(arguments[0])}"
     if arguments:
         return " or ".join(map(_words, arguments))

@@ -67,7 +67,7 @@ def read_yaml(file: Path) -> YamlFile:
         content = yaml.load(text, Loader=_Loader)
     except FieldError as error:
         raise InputError(f"{file}, {error}") from None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError) as error:  # an alias can stand within what it stands for
         raise InputError(f"{file}{_syntax(error)}") from None
     if content is None:
         content = {}
@@ -82,9 +82,9 @@ def _lines(node: yaml.Node, where: Where) -> Iterator[tuple[Where, int]]:
         seen = set()
         for key, value in node.value:
             line, way = key.start_mark.line + 1, (*where, str(key.value))
-            if key.value in seen:
+            if way in seen:
                 raise FieldError((), f"line {line}: {dotted(way)} is said twice; leave one of them")
-            seen.add(key.value)
+            seen.add(way)
             yield way, line
             yield from _lines(value, way)
     elif isinstance(node, yaml.SequenceNode):
@@ -93,10 +93,11 @@ def _lines(node: yaml.Node, where: Where) -> Iterator[tuple[Where, int]]:
             yield from _lines(item, (*where, number))
 
 
-def _syntax(error: yaml.YAMLError) -> str:
+def _syntax(error: Exception) -> str:
     mark = getattr(error, "problem_mark", None)
     line = "" if mark is None else f", line {mark.line + 1}"
-    return f"{line}: not YAML ({getattr(error, 'problem', None) or error}); correct the file"
+    problem = " ".join(str(getattr(error, "problem", None) or error).split())
+    return f"{line}: not YAML that can be read ({problem}); correct the file"
 
 
 def to_yaml(values: Mapping[str, Any], notes: Mapping[str, str]) -> str:

@@ -86,7 +86,7 @@ class SceneSettings:
 
 @dataclass(frozen=True)
 class OwnSceneSettings:
-    """The arguments of :func:`~tint_sumo.scenes.own.from_sumocfg`."""
+    """The arguments of ``tint_sumo.scenes.from_sumocfg``."""
 
     sumocfg: Path
     """SUMO configuration; its step length is the scene's."""
@@ -162,7 +162,7 @@ def scene_settings(scene: AnyScene) -> SceneSettings | OwnSceneSettings:
 
 
 def described(scene: AnyScene) -> dict[str, Any]:
-    """What the settings and the card of a run say of its scene, or of all; :func:`read_described` finds it again."""
+    """What the settings and the card of a run say of its scene, or of all; ``read_described`` finds it again."""
     if isinstance(scene, str):
         return {"scene": scene, "scene_digest": digest_of(scene)}
     changed = isinstance(scene, OwnScene) or scene.base

@@ -61,14 +61,14 @@ def test_importing_the_package_loads_no_more_than_gymnasium() -> None:
 
 def test_floors_import_downwards_only() -> None:
     floors = [
-        "compiling config errors files processes progress",
+        "compiling config errors files processes progress provenance structures yaml_files",
         "scenes",
         "simulation",
         "envs dataset",
         "traits",
         "policy",
         "study",
-        "bench",
+        "bench configuration",
         "cli",
     ]
     floor_of = {name: level for level, names in enumerate(floors) for name in names.split()}

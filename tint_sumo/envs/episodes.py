@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from tint_sumo.config import POSITION_SCALE_M, REWARD_PRESETS, SPEED_SCALE_MPS, Backend, Idm, Share
+from tint_sumo.config import POSITION_SCALE_M, REWARD_PRESETS, SPEED_SCALE_MPS, Backend, Share
 from tint_sumo.envs.rows import BOUND, NOBODY, TRACKS, Rows, Scales, TaskRules, judge, observe, observe_tracks, row_type
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, find_scene
@@ -32,7 +32,7 @@ class TaskSettings:
     reward: str = "paper"
     time_limit_s: float | None = None
     position_noise_m: float = 0.0
-    tau_s: float = Idm.tau_s
+    tau_s: float | None = None
     tracks: bool = False
     backend: Backend = "auto"
 
@@ -46,8 +46,6 @@ class TaskSettings:
             raise InputError(
                 f"time_limit_s must be at least a step of {scene.step_s:g} s, and finite, not {scene.time_limit_s}"
             )
-        if isinstance(scene, Scene) and not scene.step_s <= self.tau_s < math.inf:
-            raise InputError(f"tau_s must be at least a step of {scene.step_s:g} s, and finite, not {self.tau_s}")
 
     @property
     def slot_infos(self) -> tuple[str, ...]:
@@ -57,11 +55,12 @@ class TaskSettings:
     @cached_property
     def played(self) -> Scene | OwnScene:
         """The scene with these settings in place of its own."""
-        scene = find_scene(self.scene) if isinstance(self.scene, str) else self.scene
+        scene = find_scene(self.scene)
         if isinstance(scene, OwnScene):
             return self._own(scene)
-        population = replace(scene.population, idm=replace(scene.population.idm, tau_s=self.tau_s))
-        traffic, time_limit_s = scene.traffic, scene.time_limit_s
+        population, traffic, time_limit_s = scene.population, scene.traffic, scene.time_limit_s
+        if self.tau_s is not None:
+            population = replace(population, idm=replace(population.idm, tau_s=self.tau_s))
         if self.p_conservative is not None:
             traffic = replace(traffic, p_conservative=self.p_conservative)
         if self.time_limit_s is not None:
@@ -69,7 +68,7 @@ class TaskSettings:
         return replace(scene, traffic=traffic, population=population, time_limit_s=time_limit_s)
 
     def _own(self, scene: OwnScene) -> OwnScene:
-        if self.p_conservative is not None or self.tau_s != Idm.tau_s:
+        if self.p_conservative is not None or self.tau_s is not None:
             raise InputError("the demand of a .sumocfg tells who drives how; leave p_conservative and tau_s out")
         return scene if self.time_limit_s is None else replace(scene, time_limit_s=self.time_limit_s)
 

@@ -94,7 +94,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * `reward`: `"paper"` (default) or `"authors"` (the values of the authors' code).
     * `time_limit_s`: default 50 s.
     * `position_noise_m`: standard deviation of the noise on the others' x and y, independent per vehicle and step.
-    * `tau_s`: time headway of the others' car following (SUMO's `tau`); default 1 s.
+    * `tau_s`: time headway of the others' car following (SUMO's `tau`); default the scene's, 1 s in the built-in
+      ones.
     * `tracks`: tell in the infos, too, where vehicles are seen on their routes, with the same noise as in the
       observations; that is what trait models take. Default False.
     * `backend`: `"libsumo"`, `"traci"` (a sumo subprocess), or `"auto"` (default): libsumo if no other environment of

@@ -15,9 +15,7 @@ from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, copied
 from tint_sumo.envs.workers import WorkerBatch
 from tint_sumo.errors import InputError
-from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
-
-AnyScene = str | Scene | OwnScene
+from tint_sumo.scenes import T_INTERSECTION, AnyScene, OwnScene, Scene
 
 
 class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):

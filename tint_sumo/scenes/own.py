@@ -5,6 +5,7 @@ learn their traits takes their vTypes for labels.
 """
 
 import gzip
+import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -50,6 +51,15 @@ class SumoConfig:
         """All that the simulation follows from."""
         return (self.file, self.net_file, *self.demand_files)
 
+    @property
+    def digest(self) -> str:
+        """What tells the configuration's input from others'."""
+        whole = hashlib.sha256()
+        for file in self.files:
+            with file.open("rb") as content:
+                whole.update(hashlib.file_digest(content, "sha256").digest())
+        return whole.hexdigest()[:16]
+
 
 @dataclass(frozen=True)
 class OwnScene:
@@ -78,6 +88,10 @@ class OwnScene:
     @property
     def step_s(self) -> float:
         return self.config.step_s
+
+    @property
+    def digest(self) -> str:
+        return self.config.digest
 
     @property
     def ego(self) -> EgoTask:

@@ -73,7 +73,10 @@ class Simulation:
         """Empty a replica and start a new random episode in it."""
         sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
         self.clear(replica)
-        self._populate(replica, self._demand.begin(replica, sequence))
+        placed = self._demand.begin(replica, sequence)
+        if len(placed) > self.scene.max_vehicles:  # those who would have come last are not there yet
+            placed = sorted(placed, key=lambda one: -one.front_m)[: self.scene.max_vehicles]
+        self._populate(replica, placed)
 
     def reset_to(self, replica: int, vehicles: Sequence[PlacedVehicle]) -> None:
         """Empty a replica and start an episode with exactly these vehicles; nobody else enters.

@@ -1,11 +1,23 @@
 """What a study runs: everything that sets its cost and its quality, in one place."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
-from tint_sumo.config import P_CONSERVATIVE, Idm, PolicySettings, PpoSettings, Share, TraitSettings
+from tint_sumo.config import (
+    P_CONSERVATIVE,
+    Idm,
+    PolicySettings,
+    PpoSettings,
+    Share,
+    TraitSettings,
+    require_at_least,
+    require_positive,
+    require_share,
+)
 from tint_sumo.errors import InputError
 
 ALL_MIXES: Share = (0.1, 0.9)  # P(conservative) is drawn from this range in every episode
+SNAPSHOTS_PERCENT = (25, 50)  # of a training, after which the policy is kept, too
 
 
 @dataclass(frozen=True)
@@ -17,10 +29,23 @@ class Conditions:
     tau_s: float = Idm.tau_s
     percent: int = 100  # of the training
 
+    def __post_init__(self) -> None:
+        require_share(self.p_conservative)
+        require_at_least(self, 0, "position_noise_m")
+        require_positive(self, "tau_s")
+        if self.percent not in (*SNAPSHOTS_PERCENT, 100):
+            raise InputError(f"percent must be one of 25, 50, 100, when policies are kept, not {self.percent}")
+
     @property
     def is_single_mix(self) -> bool:
         """Whether all cases have one P(conservative), and nothing else differs from the world of the training."""
         return isinstance(self.p_conservative, float) and self == Conditions(self.p_conservative)
+
+    @property
+    def world(self) -> dict[str, Any]:
+        """What the environments are told; the headway is the scene's unless another one is tested."""
+        told = {"p_conservative": self.p_conservative, "position_noise_m": self.position_noise_m}
+        return told if self.tau_s == Idm.tau_s else {**told, "tau_s": self.tau_s}
 
     @property
     def label(self) -> str:
@@ -40,6 +65,9 @@ class Trials:
     conditions: tuple[Conditions, ...]
     episodes: int
 
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "episodes")
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -54,6 +82,17 @@ class Budget:
     seeds: tuple[int, ...] = (0, 1, 2)
     trials: tuple[Trials, ...] = ()
     with_shipped: bool = False  # test the shipped policies, too
+
+    def __post_init__(self) -> None:
+        for name in ("methods", "mixes", "seeds"):
+            values = getattr(self, name)
+            if len(set(values)) < max(1, len(values)):
+                raise InputError(f"{name} must be one or more, each of them once, not {list(values)}")
+        for mix in (self.record_p_conservative, *self.mixes):
+            require_share(mix)
+        require_at_least(self, 0, "seeds")
+        if self.traits is not None:
+            require_at_least(self, 1, "windows")
 
 
 # A small network is as accurate here as the paper's, trains in minutes and encodes 768 windows in less than 2 ms.
@@ -143,6 +182,9 @@ BUDGETS = {
         trials=(Trials(tuple(Conditions(p) for p in P_CONSERVATIVE), 500),),  # paper IV-C
     ),
 }
+
+
+PPO_BUDGETS = {name: budget.ppo for name, budget in BUDGETS.items()}
 
 
 def find_budget(name: str) -> Budget:

@@ -6,6 +6,7 @@ from pathlib import Path
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, write_json
 from tint_sumo.progress import Report
+from tint_sumo.scenes import T_INTERSECTION, Scene
 from tint_sumo.study.budgets import Trials
 from tint_sumo.study.ceiling import ceiling
 from tint_sumo.study.policy_jobs import CASES
@@ -19,6 +20,7 @@ class CeilingJob:
 
     trials: tuple[Trials, ...]
     out: Path  # of the study
+    scene: str | Scene = T_INTERSECTION
 
     name = "ceilings"
     needs: tuple[str, ...] = ()
@@ -36,7 +38,7 @@ class CeilingJob:
         found = {}
         for done, (p_conservative, episodes) in enumerate(wanted.items()):
             report(done, len(wanted), f"P {p_conservative:g}")
-            found[f"{p_conservative:g}"] = ceiling(p_conservative, episodes, CASES)
+            found[f"{p_conservative:g}"] = ceiling(p_conservative, episodes, CASES, self.scene)
         write_json(self.out / CEILINGS_FILE, found)
         return ", ".join(f"P {p}: {share:.1%}" for p, share in found.items())
 

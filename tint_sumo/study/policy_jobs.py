@@ -1,7 +1,7 @@
 """The study's jobs of training policies and of testing them."""
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_json
 from tint_sumo.progress import Report
+from tint_sumo.scenes import T_INTERSECTION, AnyScene
 from tint_sumo.study.budgets import Conditions, Trials
 from tint_sumo.study.evaluation import Evaluation, evaluate
 from tint_sumo.study.loading import load_policy
@@ -34,6 +35,7 @@ class TrainJob:
     settings: PpoSettings
     shipped_traits: bool  # rather than a trait model of the study
     out: Path  # of the study
+    scene: AnyScene = T_INTERSECTION
 
     @property
     def name(self) -> str:
@@ -71,6 +73,7 @@ class TrainJob:
             self.seed,
             self.folder,
             settings=self.settings,
+            scene=self.scene,
             traits=traits,
             report=report,
         )
@@ -86,6 +89,7 @@ class EvaluateJob:
     seed: int
     trials: tuple[Trials, ...]
     out: Path  # of the study
+    scene: AnyScene = T_INTERSECTION
 
     @property
     def name(self) -> str:
@@ -131,13 +135,16 @@ class EvaluateJob:
 
     def _test(self, conditions: Conditions, episodes: int, report: Report) -> Evaluation:
         if self.mix is None:
-            contender = load_policy(self.method)
+            contender = load_policy(self.method, scene=self.scene)
         else:
             folder = self.out / "policies" / self._label
             contender = load_policy(snapshot_stem(folder, conditions.percent).with_suffix(".safetensors"))
-        world = {key: value for key, value in asdict(conditions).items() if key != "percent"}
         return evaluate(
-            contender.policy, lambda num_envs: contender.make_venv(num_envs, **world), episodes, CASES, report=report
+            contender.policy,
+            lambda num_envs: contender.make_venv(num_envs, **conditions.world),
+            episodes,
+            CASES,
+            report=report,
         )
 
 

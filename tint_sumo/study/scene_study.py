@@ -41,6 +41,9 @@ class SceneStudy:
     recording_seed: int = 77  # of the first scene; unlike that of any dataset a shipped model was trained on
 
 
+SCENE_STUDIES = {"full": SceneStudy()}
+
+
 def run_scene_study(study: SceneStudy, out: Path, *, workers: int = 2, progress: bool = True) -> pd.DataFrame:
     """Run the comparison into ``out``; what an earlier, interrupted call has finished is not repeated.
 

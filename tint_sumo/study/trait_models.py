@@ -11,6 +11,7 @@ from tint_sumo import traits
 from tint_sumo.config import CONSERVATIVE_LABEL, LATENT_SIZE, TraitSettings
 from tint_sumo.dataset.windows import (
     Windows,
+    drivers_of,
     load_labels,
     load_windows,
     own_vtypes,
@@ -106,9 +107,11 @@ def plot_traits(
         InputError: no usable dataset or model.
     """
     trained, windows, labels, seed = _load_for_test(data, model, noise_m, other_scene)
-    if own_vtypes(read_manifest(data)):
+    manifest = read_manifest(data)
+    if own_vtypes(manifest) or len(drivers_of(manifest).profiles) > 2:
         raise InputError(
-            "the picture is of conservative and aggressive drivers, and these are of vTypes; evaluate instead"
+            "the picture is of conservative and aggressive drivers, and these are of vTypes or other profiles; "
+            "evaluate instead"
         )
     _, unseen = split_by_episode(windows, TEST_FRACTION, seed)
     files = [out / "latent.png"]

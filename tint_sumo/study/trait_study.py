@@ -45,6 +45,9 @@ class TraitStudy:
     continuous_epochs: int = 10  # properties without classes take longer to show
 
 
+TRAIT_STUDIES = {"full": TraitStudy()}
+
+
 def run_trait_study(study: TraitStudy, out: Path, *, workers: int = 2, progress: bool = True) -> TraitReport:
     """Run the comparison into ``out``; what an earlier, interrupted call has finished is not repeated.
 

@@ -61,7 +61,7 @@ def test_importing_the_package_loads_no_more_than_gymnasium() -> None:
 
 def test_floors_import_downwards_only() -> None:
     floors = [
-        "compiling config errors files processes progress",
+        "compiling config errors files processes progress timing",
         "scenes",
         "simulation",
         "envs dataset",

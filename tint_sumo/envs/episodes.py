@@ -15,6 +15,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, find_scene
 from tint_sumo.scenes.geometry import Floats
 from tint_sumo.simulation.own import make_simulation
+from tint_sumo.timing import StepPart, does
 
 _SEED_LIMIT = 2**63
 
@@ -127,6 +128,7 @@ class Episodes:
             self._noise[index] = np.random.default_rng([seed, 1])
         self._observe(slice(index, index + 1))
 
+    @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> bool:
         """Take an action, the number of a desired speed, in each environment; (N,). Whether any episode has ended."""
         simulation = self.simulation
@@ -136,6 +138,7 @@ class Episodes:
         egos = simulation.egos
         return judge(egos.front_m, egos.speed_mps, egos.collided, self.steps, self._rules, self.rows)
 
+    @does(StepPart.OBSERVATION)
     def _observe(self, envs: slice) -> None:
         """Write the observations of some environments, each with noise from its own generator."""
         egos, slots = self.simulation.egos, self.simulation.slots

@@ -59,7 +59,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise InputError(f"{len(scene)} scenes need as many workers, not {workers}; leave workers out")
         if not 1 <= len(scenes) <= num_envs:
             raise InputError(f"workers must be 1 to num_envs = {num_envs}, not {len(scenes)}")
-        require_render_mode(render_mode)
+        require_render_mode(render_mode, self.metadata["render_modes"])
         all_settings = [TaskSettings(one, **task) for one in scenes]
         settings = all_settings[0]
         if len({one.played.max_vehicles for one in all_settings}) > 1:

@@ -12,6 +12,7 @@ from tint_sumo.scenes.layout import Layout
 from tint_sumo.scenes.own import OwnScene
 from tint_sumo.scenes.scene import Scene
 from tint_sumo.simulation.slots import EMPTY, Slots
+from tint_sumo.timing import StepPart, does
 
 _STEP_MARGIN_M = 1.0  # more than a vehicle and the ego come closer in a step
 
@@ -123,6 +124,7 @@ class Egos:
         drive(desired_mps, self.unsafe, self._rules, self.speed_mps, self.front_m)
         self._place(slice(None))
 
+    @does(StepPart.CLAIMS)
     def update_claims(self) -> bool:
         """Claim routes and give them up; ``claim_changed`` (R, K) tells where that changed, the answer whether any."""
         zones = self._layout.zones
@@ -137,6 +139,7 @@ class Egos:
             self.claim_changed,
         )
 
+    @does(StepPart.SAFETY_CHECK)
     def look_around(self, slots: Slots) -> None:
         """Run the safety check for the next step, and latch collisions."""
         shape = self._layout.scene.vehicle

@@ -21,6 +21,7 @@ from tint_sumo.simulation.ego import Egos
 from tint_sumo.simulation.link import NO_COLLISION_CHECK, SumoLink
 from tint_sumo.simulation.slots import Slots
 from tint_sumo.simulation.yielding import Yielding
+from tint_sumo.timing import StepPart, does
 
 
 class Simulation:
@@ -69,6 +70,7 @@ class Simulation:
 
     # Episodes
 
+    @does(StepPart.SPAWNING)
     def reset(self, replica: int, seed: int | Sequence[int] | np.random.SeedSequence) -> None:
         """Empty a replica and start a new random episode in it."""
         sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
@@ -140,6 +142,7 @@ class Simulation:
             self.egos.look_around(self.slots)
         self._admit()
 
+    @does(StepPart.SPAWNING)
     def _admit(self) -> None:
         """Let the upcoming drivers in where there is room, a free slot, and their time has come."""
         for replica, route in self._demand.admit(self.slots, self.time_s):

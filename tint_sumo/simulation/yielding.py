@@ -8,6 +8,7 @@ from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.ego import Egos
 from tint_sumo.simulation.link import SumoLink
 from tint_sumo.simulation.slots import Slots
+from tint_sumo.timing import StepPart, does
 
 
 class Yielding:
@@ -28,6 +29,7 @@ class Yielding:
         """Which slots hold a driver whose trait it is to yield; (R, V)."""
         return np.asarray(self._yields[self._slots.member])
 
+    @does(StepPart.CLAIMS)
     def answer(self, egos: Egos) -> None:
         """Let drivers react to claims that are new, and drive on where a claim was given up."""
         slots = self._slots

@@ -111,12 +111,14 @@ class Episodes:
         scene = settings.played
         self.simulation = make_simulation(num_envs, scene, settings.backend)
         self.rows = np.zeros(num_envs, row_type(scene.max_vehicles)) if rows is None else rows
-        self._trait_of_member = np.array([*self.simulation.trait_of_member, NOBODY], np.int8)  # the last: empty slots
+        self._trait_of_member = np.array(
+            [*self.simulation.trait_of_member, NOBODY], np.int8
+        )  # the last one stands for empty slots
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
         self._scales = Scales(POSITION_SCALE_M, SPEED_SCALE_MPS, scene.step_s)
         self._speeds_mps = np.array(scene.ego.controller.desired_speeds_mps)
         self.steps = np.zeros(num_envs, np.int64)
-        self._noise: dict[int, np.random.Generator] = {}  # of each environment, where there is noise
+        self._noise: dict[int, np.random.Generator] = {}  # the generator of each environment, if there is noise
         self._noise_m: Floats = np.zeros((num_envs, scene.max_vehicles, 2))
 
     def begin(self, index: int, rng: np.random.Generator) -> None:

@@ -40,7 +40,7 @@ class EgoTask:
     edges: tuple[str, ...]
     start_m: float
     goal_m: float  # success when its front is past it
-    way: tuple[Point, ...] = ()  # its front's trace, finer than the lanes' shapes; those if not given
+    way: tuple[Point, ...] = ()  # trace of its front, finer than the lanes' shapes; those shapes if it is not given
     controller: EgoController = field(default_factory=EgoController)
 
 
@@ -72,7 +72,7 @@ class Scene:
     population: Population = field(default_factory=Population)
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     claim: Claim = field(default_factory=Claim)
-    max_vehicles: int = 12  # on the roads, and in an observation (code)
+    max_vehicles: int = 12  # so many are on the roads, and in an observation, at most (code)
     step_s: float = 0.1  # code
     time_limit_s: float = 50.0  # code
     base: str = ""  # name of the built-in scene that it is with other numbers
@@ -97,7 +97,7 @@ class Scene:
 
 T_INTERSECTION = "t_intersection"  # the paper's scene
 
-ALL_SCENES = "all"  # of a policy that was trained in every scene at once
+ALL_SCENES = "all"  # the scene's name for a policy that was trained in every scene at once
 
 SCENES: dict[str, Callable[[], Scene]] = {}
 

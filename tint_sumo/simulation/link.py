@@ -39,7 +39,7 @@ class SumoLink:
         self._vehicle = self.connection.vehicle
         self.ids = [[""] * self._slots for _ in range(replicas)]
         self.ego_ids = [""] * replicas
-        self.index: dict[str, int] = {}  # of each vehicle's slot among all replicas' slots
+        self.index: dict[str, int] = {}  # number of each vehicle's slot among all replicas' slots
         self._episodes = [0] * replicas
 
     def begin_episode(self, replica: int) -> None:

@@ -58,7 +58,7 @@ class Simulation:
         self.yielding = Yielding(replicas, self.population, self.layout, self.slots, self.link)
         self._demand = Demand(replicas, self.population, self.layout)
         self.time_s: Floats = np.zeros(replicas)
-        self.vehicle_count = [0] * replicas  # that have appeared in each replica's episode
+        self.vehicle_count = [0] * replicas  # vehicles that have appeared in each replica's episode
 
     @property
     def backend(self) -> str:

@@ -52,7 +52,7 @@ class Yielding:
             self._set(replica, slot, True)
 
     def leave(self, replica: int, slot: int) -> None:
-        """A driver has left the roads."""
+        """Forget a driver that has left the roads."""
         self.reacts[replica, slot] = False
 
     def _set(self, replica: int, slot: int, reacts: bool) -> None:

@@ -27,7 +27,7 @@ class Conditions:
     p_conservative: Share
     position_noise_m: float = 0.0
     tau_s: float = Idm.tau_s
-    percent: int = 100  # of the training
+    percent: int = 100  # part of the training after which the policy is tested
 
     def __post_init__(self) -> None:
         require_share(self.p_conservative)
@@ -73,10 +73,10 @@ class Trials:
 class Budget:
     """Sizes of all stages of a study."""
 
-    traits: TraitSettings | None  # of the trait models it learns; None: it takes the shipped ones
-    windows: int = 0  # to record for them
+    traits: TraitSettings | None  # settings of the trait models that it learns; None: it takes the shipped ones
+    windows: int = 0  # windows to record for them
     record_p_conservative: float = 0.5  # share of conservative drivers in the dataset
-    ppo: PpoSettings = field(default_factory=PpoSettings)  # with the steps of every policy
+    ppo: PpoSettings = field(default_factory=PpoSettings)  # settings of PPO, and the steps of every policy
     methods: tuple[str, ...] = ("always_go", "ttc", "no_labels", "vae", "oracle")
     mixes: tuple[Share, ...] = (ALL_MIXES,)  # P(conservative) in training: a policy for each
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -107,8 +107,8 @@ _FULL = TraitSettings(
 )
 
 TRAIT_BUDGETS = {
-    "quick": replace(_FULL, batch_size=256, epochs=20),  # for some 30,000 windows
-    "full": _FULL,  # for the paper's 696,000
+    "quick": replace(_FULL, batch_size=256, epochs=20),  # meant for some 30,000 windows
+    "full": _FULL,  # meant for the paper's 696,000
     "paper": TraitSettings(),
 }
 
@@ -119,7 +119,7 @@ _FULL_PPO = PpoSettings(
     n_epochs=4,
     n_minibatches=8,
     learning_rate=3e-3,
-    gamma=0.999,  # of a decision of 0.4 s; with less, a small risk pays more than waiting for the next gap
+    gamma=0.999,  # per decision of 0.4 s; with less, a small risk pays more than waiting for the next gap
     ent_coef=0.01,
     final_ent_coef=0.0,  # tests take the likeliest actions: what succeeds by chance must become likely
     vf_coef=0.02,  # returns are near 8: with more, their errors drown the actor's gradient in the shared layers

@@ -71,7 +71,7 @@ def _openings(simulation: Simulation) -> list[list[list[tuple[float, float]]]]:
     scene, slots, stop_line_m = simulation.scene, simulation.slots, simulation.layout.zones.stop_line_m
     routes, length_m = range(len(stop_line_m)), scene.vehicle.length_m
     openings: list[list[list[tuple[float, float]]]] = [[[] for _ in routes] for _ in range(simulation.replicas)]
-    free_since_s = np.zeros((simulation.replicas, len(routes)))  # when the last vehicle had passed
+    free_since_s = np.zeros((simulation.replicas, len(routes)))  # time at which the last vehicle had passed
     for step in range(round(scene.time_limit_s / scene.step_s)):
         number, past_m = slots.vehicle_number.copy(), slots.front_m - stop_line_m[slots.route]
         time_s = (step + 1) * scene.step_s

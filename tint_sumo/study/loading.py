@@ -31,7 +31,7 @@ class Contender:
 
     name: str
     policy: Policy
-    source: Callable[[], TraitSource] | None = None  # where the traits in its observations come from; None: no traits
+    source: Callable[[], TraitSource] | None = None  # source of the traits in its observations; None: it has no traits
     p_conservative: Share | None = DEFAULT_P_CONSERVATIVE  # what it was trained for; None in a SUMO configuration
     action_repeat: int = 1  # simulation steps per decision
     scene: AnyScene = T_INTERSECTION  # what it was trained in

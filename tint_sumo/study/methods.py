@@ -39,7 +39,7 @@ class Rule:
     """A hand-written policy."""
 
     name: str
-    title: str  # in tables and figures
+    title: str  # name in tables and figures
     make: Callable[[AnyScene], Policy]
 
 
@@ -52,7 +52,7 @@ class Learned:
     source: Callable[..., TraitSource]  # takes the trait model if there is one
     encoder: str | None = None  # trait method (``tint_sumo.traits.TRAIT_METHODS``) whose model it needs
     attention: bool = True
-    critic_sees_true_traits: bool = False  # in training; the policy itself never does
+    critic_sees_true_traits: bool = False  # only in training; the policy itself never sees them
     trained_as: str | None = None  # the method whose training it shares, if it drives with other traits than it learnt
 
     @property

@@ -130,11 +130,7 @@ class EvaluateJob:
         return low <= tested_low and tested_high <= high
 
     def _test(self, conditions: Conditions, episodes: int, report: Report) -> Evaluation:
-        if self.mix is None:
-            contender = load_policy(self.method)
-        else:
-            folder = self.out / "policies" / self._label
-            contender = load_policy(snapshot_stem(folder, conditions.percent).with_suffix(".safetensors"))
+        contender = load_policy(policy_path(self.out, self.method, self.mix, self.seed, conditions.percent))
         world = {key: value for key, value in asdict(conditions).items() if key != "percent"}
         return evaluate(
             contender.policy, lambda num_envs: contender.make_venv(num_envs, **world), episodes, CASES, report=report
@@ -152,6 +148,13 @@ def label(method: str, mix: Share | None, seed: int) -> str:
         return method if isinstance(find_method(method), Rule) else f"{method}-shipped"
     low, high = ends(mix)
     return f"{method}-P{low:g}-seed{seed}" if low == high else f"{method}-P{low:g}to{high:g}-seed{seed}"
+
+
+def policy_path(out: Path, method: str, mix: Share | None, seed: int, percent: int = 100) -> str | Path:
+    """Where a policy of the study in ``out`` is after some percent of its training; the name of one that was given."""
+    if mix is None:
+        return method
+    return snapshot_stem(out / "policies" / label(method, mix, seed), percent).with_suffix(".safetensors")
 
 
 def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:

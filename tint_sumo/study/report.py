@@ -27,10 +27,12 @@ class StudyReport:
     """What was written, and the tables themselves."""
 
     rows: tuple[Row, ...]
+    tables: tuple[Table, ...]
     markdown: str
     csv_file: Path
     markdown_file: Path
     figure_files: tuple[Path, ...]
+    page_file: Path | None = None  # until the page is written
 
 
 def write_report(out: Path) -> StudyReport:
@@ -47,8 +49,9 @@ def write_report(out: Path) -> StudyReport:
         figures.append(plot_worlds(over_all_mixes(rows), out / "worlds.png"))
     if curves := read_curves(out):
         figures.append(plot_curves(curves, out / "curves.png"))
-    markdown = to_markdown(rows, ceilings)
-    report = StudyReport(tuple(rows), markdown, out / "results.csv", out / "results.md", tuple(figures))
+    tables = result_tables(rows, ceilings)
+    markdown = to_markdown(tables)
+    report = StudyReport(tuple(rows), tuple(tables), markdown, out / "results.csv", out / "results.md", tuple(figures))
     write_text(report.csv_file, to_csv(rows, ceilings))
     write_text(report.markdown_file, markdown)
     return report
@@ -84,14 +87,12 @@ def to_csv(rows: Sequence[Row], ceilings: Ceilings) -> str:
     return text.getvalue()
 
 
-def to_markdown(rows: Sequence[Row], ceilings: Ceilings) -> str:
-    """All tables for readers."""
-    parts = [part for table in result_tables(rows, ceilings) for part in table.markdown]
-    return "\n\n".join(parts) + "\n"
+def to_markdown(tables: Sequence[Table]) -> str:
+    return "\n\n".join(part for table in tables for part in table.markdown) + "\n"
 
 
 def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
-    """All that there is to tell of these rows."""
+    """All tables for readers."""
     main, worlds = at_mixes(rows), over_all_mixes(rows)
     tables = []
     if main:

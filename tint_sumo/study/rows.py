@@ -36,10 +36,15 @@ class Row:
     evaluations: tuple[Evaluation, ...]  # of each seed
 
     @property
+    def is_shipped(self) -> bool:
+        """Whether the package came with the policy."""
+        return self.origin == GIVEN and isinstance(METHODS.get(self.method), Learned)
+
+    @property
     def title(self) -> str:
         method = METHODS.get(self.method)
         title = self.method if method is None else method.title
-        return f"{title} (shipped)" if self.origin == GIVEN and isinstance(method, Learned) else title
+        return f"{title} (shipped)" if self.is_shipped else title
 
     @property
     def episodes(self) -> int:

@@ -13,7 +13,19 @@ from tint_sumo.study.rows import WORLDS, Row, by_title, varied
 from tint_sumo.study.tables import Lines
 
 # Of middling lightness, to be seen on white and on black; lines differ in marker and dash, too.
-_COLOURS = ("#2f7fc1", "#c2571a", "#2a8f5b", "#b0468f", "#8a6fd1", "#8c7324", "#c8475a", "#4a8c99", "#7a7f87")
+_COLOURS = (
+    "#2f7fc1",
+    "#c2571a",
+    "#2a8f5b",
+    "#b0468f",
+    "#8a6fd1",
+    "#8c7324",
+    "#c8475a",
+    "#4a8c99",
+    "#7a7f87",
+    "#a5541b",
+    "#4f6fe0",
+)
 _MARKERS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-down", "cross", "hexagon", "pentagon")
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
 _ROW_PX = 46  # of a method
@@ -70,7 +82,8 @@ def curve_chart(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Chart:
     """Success in training against decisions: the mean over the seeds, and the range between them as a band."""
     traces: list[dict[str, Any]] = []
     lines = [["method", "decisions", "success %", "range of the seeds"]]
-    for position, (method, seeds) in enumerate(curves.items()):
+    for method, seeds in curves.items():
+        position = _position(method)
         shares = [one.set_index("decisions")["success"].rolling(_SMOOTHED, min_periods=1).mean() for one in seeds]
         percent = 100.0 * pd.concat(shares, axis=1).dropna()
         at, title = percent.index.to_numpy(), METHODS[method].title
@@ -96,12 +109,13 @@ def world_charts(rows: Sequence[Row]) -> list[Chart]:
     charts = []
     for name, title in WORLDS.items():
         traces, lines = [], [["method", title, "success %", "95 % interval"]]
-        for position, (method, own) in enumerate(by_title(rows).items()):
+        for method, own in by_title(rows).items():
+            position = _position(own[0].method)
             points = varied(own, name)
             percent, limits = _rates(list(points.values()), "success")
             for value, share, (low, high) in zip(points, percent, limits, strict=True):
                 lines.append([method, f"{value:g}", f"{share:.1f}", f"{low:.1f} to {high:.1f}"])
-            line = _marks(list(points), percent, position, method)
+            line = _marks(list(points), percent, position, method, is_open=own[0].is_shipped)
             traces.append(
                 {**line, "mode": "lines+markers", "line": _line(position), "error_y": _errors(percent, limits)}
             )
@@ -130,8 +144,14 @@ def _errors(percent: Sequence[float], limits: Sequence[tuple[float, float]]) -> 
     return {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1.2, "width": 3}
 
 
-def _marks(x: Any, y: Any, position: int, name: str) -> dict[str, Any]:
-    marker = {"symbol": _MARKERS[position % len(_MARKERS)], "size": 8, "color": _colour(position)}
+def _position(method: str) -> int:
+    """A method looks the same in every chart."""
+    return list(METHODS).index(method) if method in METHODS else len(METHODS)
+
+
+def _marks(x: Any, y: Any, position: int, name: str, *, is_open: bool = False) -> dict[str, Any]:
+    symbol = _MARKERS[position % len(_MARKERS)] + ("-open" if is_open else "")
+    marker = {"symbol": symbol, "size": 8, "color": _colour(position)}
     return {"type": "scatter", "x": list(map(float, x)), "y": list(map(float, y)), "name": name, "marker": marker}
 
 

@@ -11,13 +11,11 @@ from tint_sumo.config import ends
 from tint_sumo.errors import InputError
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import Case
-from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import METHODS
 from tint_sumo.study.page.choosing import FAILURES, Choice, Shown
-from tint_sumo.study.page.html import bullets, folded, json_data, packed, paragraph
+from tint_sumo.study.page.html import bullets, json_data, packed, paragraph
 from tint_sumo.study.page.recording import MISSING, UNITS, Recording, read_episodes, record_all
 from tint_sumo.study.page.roads import scene_shapes
-from tint_sumo.study.policy_jobs import policy_path
 
 
 @dataclass(frozen=True)
@@ -47,16 +45,16 @@ def record_episodes(out: Path, choice: Choice, *, workers: int, progress: bool) 
     ready: list[tuple[Shown, Recording]] = []
     refusals = []
     for one in choice.policies:
+        recording = Recording(one.method, one.mix, one.seed, choice.conditions, choice.cases, out)
         try:
-            load_policy(policy_path(out, one.method, one.mix, one.seed))
+            recording.require_policy()
         except InputError as error:
             refusals.append(f"{one.title}: {error}")
         else:
-            ready.append((one, Recording(one.method, one.mix, one.seed, choice.conditions, choice.cases, out)))
+            ready.append((one, recording))
     record_all([recording for _, recording in ready], workers, progress)
-    return Recordings(
-        choice, tuple(Recorded(one, *read_episodes(recording.file)) for one, recording in ready), tuple(refusals)
-    )
+    recorded = tuple(Recorded(one, *read_episodes(recording.file)) for one, recording in ready)
+    return Recordings(choice, recorded, tuple(refusals))
 
 
 def player_data(recordings: Recordings) -> str:
@@ -112,22 +110,21 @@ def player_notes(recordings: Recordings) -> str:
 
 def failure_lists(recordings: Recordings) -> str:
     """Of each policy: how often it failed, and its recorded failures as buttons that open the player."""
-    return "".join(_failures(one, len(recordings.policies) == 1) for one in recordings.policies)
+    return "".join(_failures(one) for one in recordings.policies)
 
 
-def _failures(one: Recorded, alone: bool) -> str:
+def _failures(one: Recorded) -> str:
     cases = one.policy.evaluation.cases
     counts = {outcome: sum(case.outcome == outcome for case in cases) for outcome in FAILURES}
     failed = {case: episode for case, episode in one.episodes.items() if episode["outcome"] in FAILURES}
     told = " and ".join(_count(number, outcome) for outcome, number in counts.items())
-    summary = f"{one.policy.title}: {told} in {len(cases)} cases, {len(failed)} of them recorded"
     buttons = [
         f'<button type="button" data-policy="{escape(one.policy.label)}" data-case="{case}">'
         f"{escape(_told(case, episode, cases[case]))}</button>"
         for case, episode in failed.items()
     ]
-    content = bullets(buttons) if buttons else paragraph("None of its failures was recorded.")
-    return folded(summary, content, is_open=alone)
+    note = paragraph(f"{told} in {len(cases)} cases; {len(failed)} failures were recorded.")
+    return f"<h3>{escape(one.policy.title)}</h3>" + note + (bullets(buttons) if buttons else "")
 
 
 def _told(number: int, episode: dict[str, Any], case: Case) -> str:

@@ -27,10 +27,9 @@ def table(lines: Lines, caption: str) -> str:
     )
 
 
-def folded(summary: str, *content: str, is_open: bool = False) -> str:
+def folded(summary: str, *content: str) -> str:
     """Something that opens when it is asked for, and in print."""
-    opening = "<details open>" if is_open else "<details>"
-    return f"{opening}<summary>{escape(summary)}</summary>{''.join(content)}</details>"
+    return f"<details><summary>{escape(summary)}</summary>{''.join(content)}</details>"
 
 
 def paragraph(text: str) -> str:

@@ -16,11 +16,13 @@ import tint_sumo
 from tint_sumo.config import Share
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, write_text
+from tint_sumo.policy.storage import read_policy_card, weights_file
 from tint_sumo.progress import Report
 from tint_sumo.scenes import find_scene
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.driving import Moment, drive_case
-from tint_sumo.study.loading import load_policy
+from tint_sumo.study.loading import find_policy, load_policy
+from tint_sumo.study.methods import METHODS, Rule
 from tint_sumo.study.policy_jobs import CASES, label, policy_path
 from tint_sumo.study.pool import THREADS_PER_JOB, run_jobs
 from tint_sumo.study.trait_reader import TraitReader, fit_reader
@@ -65,11 +67,19 @@ class Recording:
     def file(self) -> Path:
         return self.out / EPISODES / f"{self.label}.json"
 
+    def require_policy(self) -> None:
+        """Raise InputError unless there is a policy that can be loaded."""
+        load_policy(self._policy)
+
+    @property
+    def _policy(self) -> str | Path:
+        return policy_path(self.out, self.method, self.mix, self.seed)
+
     @property
     def _identity(self) -> dict[str, Any]:
         identity = {
             "format": FORMAT,
-            "policy": _digest(policy_path(self.out, self.method, self.mix, self.seed)),
+            "policy": _digest(self._policy),
             "conditions": asdict(self.conditions),
             "cases": self.cases,
         }
@@ -77,11 +87,15 @@ class Recording:
         return read
 
     def is_done(self) -> bool:
-        """Whether the file there is of this very policy and these very cases."""
+        """Whether the file there is of this very policy and these very cases.
+
+        Raises:
+            InputError: there is no such policy, or the file is damaged.
+        """
         return self.file.exists() and read_json(self.file, "recorded episodes").get("recorded") == self._identity
 
     def make(self, report: Report) -> None:
-        contender = load_policy(policy_path(self.out, self.method, self.mix, self.seed))
+        contender = load_policy(self._policy)
         reader, routes = fit_reader(contender), [route.name for route in find_scene(contender.scene).routes]
         world = {key: value for key, value in asdict(self.conditions).items() if key != "percent"}
         episodes = {}
@@ -137,11 +151,12 @@ def read_episodes(file: Path) -> tuple[str, dict[int, dict[str, Any]]]:
 
 
 def _digest(policy: str | Path) -> str:
-    """What tells a policy's weights and its card from others; the package's version where they come with it."""
-    if isinstance(policy, str):
+    """What tells a policy's weights and its card from others; for a rule the package's version."""
+    if isinstance(METHODS.get(str(policy)), Rule):
         return tint_sumo.__version__
-    files = (policy, policy.with_suffix(".json"))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    stem = find_policy(policy)
+    card = json.dumps(read_policy_card(stem), sort_keys=True)
+    return hashlib.sha256(weights_file(stem).read_bytes() + card.encode()).hexdigest()
 
 
 def encode(moments: Sequence[Moment], reader: TraitReader | None, routes: Sequence[str]) -> dict[str, Any]:

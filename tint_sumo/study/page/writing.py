@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -13,16 +13,14 @@ from plotly.offline import get_plotlyjs
 
 import tint_sumo
 from tint_sumo.files import RUN_FILE, read_json, write_text
-from tint_sumo.study.ceiling_job import read_ceilings
 from tint_sumo.study.page.charts import Chart, curve_chart, outcome_chart, world_charts
 from tint_sumo.study.page.choosing import choose
 from tint_sumo.study.page.episodes import Recordings, failure_lists, player_data, player_notes, record_episodes
 from tint_sumo.study.page.html import chart, folded, json_data, packed, paragraph, section, table
 from tint_sumo.study.page.latents import read_latents
 from tint_sumo.study.policy_jobs import read_curves
-from tint_sumo.study.report import result_tables
-from tint_sumo.study.results import read_results
-from tint_sumo.study.rows import Row, at_mixes, over_all_mixes, tabulate
+from tint_sumo.study.report import StudyReport
+from tint_sumo.study.rows import Row, at_mixes, over_all_mixes
 from tint_sumo.study.tables import Lines, Table
 from tint_sumo.study.training import POLICY
 
@@ -36,38 +34,41 @@ class _Study:
     """All that the page tells."""
 
     out: Path
-    rows: list[Row]
+    rows: tuple[Row, ...]
     tables: dict[str, Table]  # by their headings
     curves: Chart | None
     recordings: Recordings
     latents: dict[str, Any] | None
 
 
-def write_page(out: Path, *, workers: int = 2, progress: bool = True) -> Path:
+def write_page(report: StudyReport, out: Path, *, workers: int = 2, progress: bool = True) -> StudyReport:
     """Write report.html into a study's folder: one file that needs no network.
 
     The episodes it shows are recorded first, into ``episodes`` there; what is recorded already is not repeated.
 
     Args:
-        out: folder of a study with results.
+        report: of the study.
+        out: the study's folder.
         workers: processes at a time that record.
         progress: show progress bars on stderr.
 
+    Returns:
+        The report with the page's file.
+
     Raises:
-        InputError: there are no results, or a file is damaged.
+        InputError: a file is damaged.
     """
-    rows = tabulate(read_results(out))
     curves = read_curves(out)
     study = _Study(
         out,
-        rows,
-        {one.heading: one for one in result_tables(rows, read_ceilings(out))},
+        report.rows,
+        {one.heading: one for one in report.tables},
         curve_chart(curves) if curves else None,
-        record_episodes(out, choose(rows), workers=workers, progress=progress),
-        read_latents(out, [row.method for row in rows], progress=progress),
+        record_episodes(out, choose(report.rows), workers=workers, progress=progress),
+        read_latents(out, [row.method for row in report.rows], progress=progress),
     )
     write_text(out / PAGE_FILE, _page(study))
-    return out / PAGE_FILE
+    return replace(report, page_file=out / PAGE_FILE)
 
 
 def _page(study: _Study) -> str:

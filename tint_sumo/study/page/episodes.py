@@ -129,7 +129,7 @@ def _failures(one: Recorded) -> str:
 
 def _told(number: int, episode: dict[str, Any], case: Case) -> str:
     text = f"Case {number}: {episode['outcome']} after {episode['time_s']:.1f} s"
-    return text + (f", hit: {case.trait} driver on route {case.route}" if _agree(episode, case) and case.trait else "")
+    return text + (f" ({case.trait}, {case.route})" if _agree(episode, case) and case.trait else "")
 
 
 def _agree(episode: dict[str, Any], case: Case) -> bool:

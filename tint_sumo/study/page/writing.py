@@ -26,7 +26,7 @@ from tint_sumo.study.training import POLICY
 
 PAGE_FILE = "report.html"
 _STATIC = Path(__file__).with_name("static")
-_SCRIPTS = ("unpacking.js", "theme.js", "scene.js", "player.js", "latents.js", "charts.js")
+_SCRIPTS = ("unpacking.js", "theme.js", "printing.js", "scene.js", "player.js", "latents.js", "charts.js")
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,9 @@ def _player(study: _Study) -> str:
 def _failures(study: _Study) -> str:
     if not study.recordings.policies:
         return _left_out("no episodes were recorded")
-    return paragraph("A failure opens in the episode player.") + failure_lists(study.recordings)
+    return paragraph(
+        "A failure opens in the episode player. Collisions name the driver that was hit: trait and route."
+    ) + failure_lists(study.recordings)
 
 
 def _latents(study: _Study) -> str:

@@ -52,16 +52,6 @@ const listenToCharts = () => {
   addEventListener("afterprint", () => drawCharts());
 };
 
-// All that is folded is open in print.
-const folds = [];
-addEventListener("beforeprint", () => {
-  folds.push(...document.querySelectorAll("details:not([open])"));
-  for (const fold of folds) fold.open = true;
-});
-addEventListener("afterprint", () => {
-  for (const fold of folds.splice(0)) fold.open = false;
-});
-
 if (byId("plotly")) {
   await new Promise((painted) => requestAnimationFrame(() => setTimeout(painted)));
   document.body.append(make("script", {}, await unpack("plotly")));

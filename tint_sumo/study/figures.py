@@ -14,6 +14,7 @@ from tint_sumo.config import ends
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.files import whole_file
 from tint_sumo.study.methods import METHODS
+from tint_sumo.study.policy_jobs import smoothed_percent
 from tint_sumo.study.rows import WORLDS, Row, by_title, varied
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
@@ -87,8 +88,7 @@ def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Pat
     figure = Figure(figsize=(7.5, 4.6), dpi=150, layout="constrained")
     axes = figure.subplots()
     for position, (method, seeds) in enumerate(curves.items()):
-        shares = [one.set_index("decisions")["success"].rolling(5, min_periods=1).mean() for one in seeds]
-        percent = 100.0 * pd.concat(shares, axis=1).dropna()
+        percent = smoothed_percent(seeds)
         style = _line_style(position) | {"markevery": 0.12}
         axes.plot(percent.index, percent.mean(axis=1), label=METHODS[method].title, **style)
         axes.fill_between(

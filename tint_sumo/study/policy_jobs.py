@@ -1,6 +1,7 @@
 """The study's jobs of training policies and of testing them."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Measured, Result
 from tint_sumo.study.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
 
 CASES = 0  # the set of cases that all policies are tested on
+_SMOOTHED = 5  # points of a learning curve
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,12 @@ def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
     files = {name: sorted((out / "policies").glob(f"{name}-P*/{CURVE_FILE}")) for name in METHODS}
     found = {name: [curve for curve in map(_read_curve, own) if len(curve)] for name, own in files.items()}
     return {name: curves for name, curves in found.items() if curves}
+
+
+def smoothed_percent(seeds: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Success in training, %: a row for each number of decisions, a column for each seed."""
+    shares = [one.set_index("decisions")["success"].rolling(_SMOOTHED, min_periods=1).mean() for one in seeds]
+    return 100.0 * pd.concat(shares, axis=1).dropna()
 
 
 def _read_curve(file: Path) -> pd.DataFrame:

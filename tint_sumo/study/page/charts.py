@@ -9,28 +9,19 @@ import pandas as pd
 
 from tint_sumo.config import ends
 from tint_sumo.study.methods import METHODS
+from tint_sumo.study.policy_jobs import smoothed_percent
 from tint_sumo.study.rows import WORLDS, Row, by_title, varied
 from tint_sumo.study.tables import Lines
 
 # Of middling lightness, to be seen on white and on black; lines differ in marker and dash, too.
 _COLOURS = (
-    "#2f7fc1",
-    "#c2571a",
-    "#2a8f5b",
-    "#b0468f",
-    "#8a6fd1",
-    "#8c7324",
-    "#c8475a",
-    "#4a8c99",
-    "#7a7f87",
-    "#a5541b",
-    "#4f6fe0",
+    *("#2f7fc1", "#c2571a", "#2a8f5b", "#b0468f", "#8a6fd1", "#8c7324"),
+    *("#c8475a", "#4a8c99", "#7a7f87", "#5f8f1f", "#4f6fe0"),
 )
 _MARKERS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-down", "cross", "hexagon", "pentagon")
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
 _ROW_PX = 46  # of a method
 _CURVE_LINES = 10  # of the table of learning curves
-_SMOOTHED = 5  # points of a learning curve
 
 
 @dataclass(frozen=True)
@@ -84,8 +75,7 @@ def curve_chart(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Chart:
     lines = [["method", "decisions", "success %", "range of the seeds"]]
     for method, seeds in curves.items():
         position = _position(method)
-        shares = [one.set_index("decisions")["success"].rolling(_SMOOTHED, min_periods=1).mean() for one in seeds]
-        percent = 100.0 * pd.concat(shares, axis=1).dropna()
+        percent = smoothed_percent(seeds)
         at, title = percent.index.to_numpy(), METHODS[method].title
         middle, low, high = percent.mean(axis=1), percent.min(axis=1), percent.max(axis=1)
         if len(seeds) > 1:

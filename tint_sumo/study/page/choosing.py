@@ -45,10 +45,9 @@ def choose(rows: Sequence[Row]) -> Choice:
     numbers = {one: sum(row.conditions == one for row in tested) for one in (row.conditions for row in tested)}
     common = [one for one, number in numbers.items() if number == max(numbers.values())]
     conditions = common[(len(common) - 1) // 2]
+    firsts = {title: own[0] for title, own in by_title([row for row in tested if row.conditions == conditions]).items()}
     policies = tuple(
-        Shown(title, row.method, row.mix, row.seeds[0], row.evaluations[0])
-        for title, own in by_title([row for row in tested if row.conditions == conditions]).items()
-        for row in own[:1]
+        Shown(title, row.method, row.mix, row.seeds[0], row.evaluations[0]) for title, row in firsts.items()
     )
     return Choice(conditions, policies, choose_cases([one.evaluation for one in policies]))
 

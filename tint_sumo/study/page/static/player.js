@@ -57,10 +57,13 @@ class Pane {
     this.details.toggleAttribute("hidden", !policy);
     this.episode = null;
     this.list.replaceChildren();
+    const name = policy ? `episode-${policy.label}-${number}` : null;
+    this.wanted = name;
     if (!policy) return;
+    const text = await unpack(name);
+    if (this.wanted !== name) return; // something else was chosen meanwhile
     const shapes = this.contents.scenes[policy.scene];
-    const content = JSON.parse(await unpack(`episode-${policy.label}-${number}`));
-    this.episode = new Episode(content, this.contents, shapes.traits);
+    this.episode = new Episode(JSON.parse(text), this.contents, shapes.traits);
     this.step_s = shapes.step_s;
     this.title = policy.title;
     this.view = new SceneView(this.svg, shapes);

@@ -123,7 +123,7 @@ def _failures(one: Recorded) -> str:
         f"{escape(_told(case, episode, cases[case]))}</button>"
         for case, episode in failed.items()
     ]
-    note = paragraph(f"{told} in {len(cases)} cases; {len(failed)} failures were recorded.")
+    note = paragraph(f"{told} in {len(cases)} cases. Failures among the recorded cases: {len(failed)}.")
     return f"<h3>{escape(one.policy.title)}</h3>" + note + (bullets(buttons) if buttons else "")
 
 

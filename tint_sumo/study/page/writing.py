@@ -152,7 +152,7 @@ def _failures(study: _Study) -> str:
     if not study.recordings.policies:
         return _left_out("no episodes were recorded")
     return paragraph(
-        "A failure opens in the episode player. Collisions name the driver that was hit: trait and route."
+        "A failure opens in the episode player. Of a collision it says which driver was hit: trait and route."
     ) + failure_lists(study.recordings)
 
 

@@ -246,7 +246,7 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     (tmp_path / RESULTS / "one.json").write_text(json.dumps(result.to_json()))
     printed = run(capsys, "study", "report", "--out", tmp_path)
     assert [(row["method"], row["success"]) for row in printed["results"]] == [("ttc", 1.0)]
-    assert [Path(file).name for file in printed["files"]] == ["results.csv", "results.md", "results.png"]
+    assert [Path(file).name for file in printed["files"]] == ["results.csv", "results.md", "results.png", "report.html"]
     assert all(Path(file).is_file() for file in printed["files"])
     assert main(["study", "report", "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out

@@ -505,15 +505,16 @@ class RunStudy(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class ReportStudy(Command):
-    """Make a study's results table and figure again."""
+    """Make a study's tables, figures and page again; the page's episodes are recorded if they are not there."""
 
     out: Path = Path("runs/quick")
     """Folder of the study."""
 
     def run(self) -> Outcome:
+        from tint_sumo.study.page import write_page
         from tint_sumo.study.report import write_report
 
-        return _report_outcome(write_report(self.out))
+        return _report_outcome(write_page(write_report(self.out), self.out))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -740,7 +741,7 @@ def _use_one_thread() -> None:
 
 
 def _report_outcome(report: "StudyReport") -> Outcome:
-    files = [report.csv_file, report.markdown_file, *report.figure_files]
+    files = [report.csv_file, report.markdown_file, *report.figure_files, report.page_file]
     text = "\n".join([report.markdown, *(f"wrote {file}" for file in files)])
     return Outcome(text, {"results": [row.to_json() for row in report.rows], "files": [str(file) for file in files]})
 

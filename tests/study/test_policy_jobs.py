@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -147,9 +148,9 @@ def test_mixes_that_a_policy_is_tested_at_lie_within_those_of_its_training(
 def test_parts_of_a_training_are_other_policies(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded: list[Path] = []
 
-    def load(file: Path) -> object:
+    def load(file: Path, **scene: Any) -> object:
         loaded.append(file)
-        return load_policy(file)
+        return load_policy(file, **scene)
 
     monkeypatch.setattr(policy_jobs, "load_policy", load)
     parts = tuple(Conditions(0.4, percent=percent) for percent in (100, 25, 50))

@@ -11,6 +11,7 @@ from tint_sumo.study.budgets import Budget
 from tint_sumo.study.ceiling_job import CeilingJob
 from tint_sumo.study.loading import shipped_policies
 from tint_sumo.study.methods import Learned, find_method
+from tint_sumo.study.page import write_page
 from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
 from tint_sumo.study.pool import Job, run_jobs
 from tint_sumo.study.report import StudyReport, write_report
@@ -67,7 +68,7 @@ def run_study(
                 progress=progress,
             )
         run_jobs(jobs, workers, progress)
-        return write_report(out)
+        return write_page(write_report(out), out, workers=workers, progress=progress)
 
 
 def _require_scene(budget: Budget, scene: str | Scene) -> None:

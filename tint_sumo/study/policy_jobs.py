@@ -1,6 +1,7 @@
 """The study's jobs of training policies and of testing them."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,6 +24,7 @@ from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Measured, Result
 from tint_sumo.study.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
 
 CASES = 0  # the set of cases that all policies are tested on
+_SMOOTHED = 5  # points of a learning curve
 
 
 @dataclass(frozen=True)
@@ -134,11 +136,8 @@ class EvaluateJob:
         return low <= tested_low and tested_high <= high
 
     def _test(self, conditions: Conditions, episodes: int, report: Report) -> Evaluation:
-        if self.mix is None:
-            contender = load_policy(self.method, scene=self.scene)
-        else:
-            folder = self.out / "policies" / self._label
-            contender = load_policy(snapshot_stem(folder, conditions.percent).with_suffix(".safetensors"))
+        path = policy_path(self.out, self.method, self.mix, self.seed, conditions.percent)
+        contender = load_policy(path, scene=self.scene if self.mix is None else None)
         return evaluate(
             contender.policy,
             lambda num_envs: contender.make_venv(num_envs, **conditions.world),
@@ -161,6 +160,13 @@ def label(method: str, mix: Share | None, seed: int) -> str:
     return f"{method}-P{low:g}-seed{seed}" if low == high else f"{method}-P{low:g}to{high:g}-seed{seed}"
 
 
+def policy_path(out: Path, method: str, mix: Share | None, seed: int, percent: int = 100) -> str | Path:
+    """Where a policy of the study in ``out`` is after some percent of its training; the name of one that was given."""
+    if mix is None:
+        return method
+    return snapshot_stem(out / "policies" / label(method, mix, seed), percent).with_suffix(".safetensors")
+
+
 def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
     """Curves of the trainings of the study in ``out``, one per seed, by method in the registry's order.
 
@@ -172,6 +178,12 @@ def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
     files = {name: sorted((out / "policies").glob(f"{name}-P*/{CURVE_FILE}")) for name in METHODS}
     found = {name: [curve for curve in map(_read_curve, own) if len(curve)] for name, own in files.items()}
     return {name: curves for name, curves in found.items() if curves}
+
+
+def smoothed_percent(seeds: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Success in training, %: a row for each number of decisions, a column for each seed."""
+    shares = [one.set_index("decisions")["success"].rolling(_SMOOTHED, min_periods=1).mean() for one in seeds]
+    return 100.0 * pd.concat(shares, axis=1).dropna()
 
 
 def _read_curve(file: Path) -> pd.DataFrame:

@@ -243,12 +243,17 @@ class TrainTraits(Command):
     """Seed of the training, and of the split into training and test episodes."""
 
     def run(self) -> Outcome:
+        from tint_sumo.job_table import one_job
+        from tint_sumo.standings import Title
         from tint_sumo.study.trait_models import require_noise, train_traits
 
         _use_one_thread()
         require_noise(self.noise)
         settings = replace(_TRAIT_BUDGET.full(self.budget), noise_m=self.noise)
-        card = train_traits(self.data, self.out, method=self.method, settings=settings, seed=self.seed)
+        with one_job(Title("traits", self.method, seed=self.seed)) as report:
+            card = train_traits(
+                self.data, self.out, method=self.method, settings=settings, seed=self.seed, report=report
+            )
         return Outcome(
             f"trained {self.method} on {card['windows']} windows: {self.out}", {**card, "out": str(self.out)}
         )
@@ -389,18 +394,22 @@ class TrainPolicy(Command):
     """Write the policy as Stable-Baselines3's policy.zip, too. That is a pickle: others must trust you to read it."""
 
     def run(self) -> Outcome:
-        from tint_sumo.progress import progress_bar
+        from tint_sumo.config import share_words
+        from tint_sumo.job_table import one_job
         from tint_sumo.scenes import OwnScene
+        from tint_sumo.standings import Title
         from tint_sumo.study.training import train_policy
 
         _use_one_thread()
         is_own = isinstance(self.scene, OwnScene) and self.p_conservative == TrainPolicy.p_conservative
         settings = _PPO_BUDGET.full(self.budget)
         steps = settings.total_steps if self.steps is None else self.steps
-        with progress_bar(f"policy {self.method}", "step") as report:
+        share = None if is_own else _share(self.p_conservative)
+        mix = "" if share is None else share_words(share)
+        with one_job(Title("train", self.method, mix, self.seed)) as report:
             policy = train_policy(
                 self.method,
-                None if is_own else _share(self.p_conservative),
+                share,
                 steps,
                 self.seed,
                 self.out,
@@ -447,7 +456,7 @@ class EvaluatePolicy(Command):
         _use_one_thread()
         contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
         world = _world(contender, self.p_conservative, self.noise, self.tau)
-        with progress_bar(self.model, "case") as report:
+        with progress_bar(self.model) as report:
             evaluation = evaluate(
                 contender.policy,
                 lambda num_envs: contender.make_venv(num_envs, **world),
@@ -572,7 +581,7 @@ class Render(Command):
         _use_one_thread()
         contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
         world = _world(contender, self.p_conservative, self.noise, self.tau)
-        with progress_bar(str(self.out), "frame") as report:
+        with progress_bar(str(self.out)) as report:
             film = render_case(contender, self.case, self.out, seed=self.seed, report=report, **world)
         text = f"{film.outcome} after {film.time_s:.1f} s, {film.frames} frames: {self.out}"
         content = {"model": self.model, "scene": contender.scene_name, **world, "case": self.case, "seed": self.seed}

@@ -174,6 +174,12 @@ def ends(share: Share) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def share_words(share: Share) -> str:
+    """A share for people to read."""
+    low, high = ends(share)
+    return f"{low:g}" + (f" to {high:g}" if high > low else "")
+
+
 def is_share(value: object) -> bool:
     """Whether a value is a probability or a range of probabilities."""
     try:

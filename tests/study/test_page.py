@@ -14,6 +14,7 @@ import pytest
 from tests.study.scenes import given, trained, write_results
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_text
+from tint_sumo.progress import silent
 from tint_sumo.scenes import SCENES, find_scene
 from tint_sumo.scenes.geometry import POSE
 from tint_sumo.scenes.layout import layout
@@ -147,18 +148,18 @@ def test_recordings_tell_the_case_and_are_made_once_for_a_policy_and_its_cases(t
     recording = Recording("always_go", None, 0, Conditions(0.4), (2, 0), tmp_path)
     job = RecordJob(0, (recording,))
     assert not job.is_done()
-    assert job.run(lambda *_: None).startswith("1 policies")
+    assert job.run(silent) == "policies: 1"
     episodes = read_episodes(recording.file)
     assert list(episodes) == [2, 0]
     driven = list(drive_case(load_policy("always_go"), 2, 0, p_conservative=0.4))
     assert (episodes[2]["outcome"], episodes[2]["frames"]) == (driven[-1].outcome, len(driven))
     assert decoded("x_m", episodes[2]["ego"]["x_m"]) == pytest.approx([one.ego["x_m"] for one in driven], abs=0.006)
     written = recording.file.read_bytes()
-    assert job.is_done() and job.run(lambda *_: None).startswith("0 policies")
+    assert job.is_done() and job.run(silent) == "policies: 0"
     other = replace(recording, cases=(0,))
     assert not other.is_done() and not replace(recording, conditions=Conditions(0.6)).is_done()
     recording.file.unlink()
-    recording.make(lambda *_: None)
+    recording.make(silent)
     assert recording.file.read_bytes() == written
 
 
@@ -281,7 +282,7 @@ def test_the_page_leads_nowhere_else_and_is_small(bare: str) -> None:
 
 def test_a_page_is_the_same_every_time(tmp_path: Path) -> None:
     out = write_results([given("always_go", {Conditions(ALL_MIXES): (1, 0, 0)})], tmp_path)
-    Recording("always_go", None, 0, Conditions(ALL_MIXES), (0,), out).make(lambda *_: None)
+    Recording("always_go", None, 0, Conditions(ALL_MIXES), (0,), out).make(silent)
     first, second = (write_page(write_report(out), out, progress=False).page_file for _ in range(2))
     assert first is not None and second is not None
     assert first.read_bytes() == second.read_bytes()

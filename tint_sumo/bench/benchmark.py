@@ -377,7 +377,6 @@ def _train_windows_per_s(method: str, windows: int) -> float:
             Path(folder),
             method=method,
             conservative=labels,
-            progress=False,
         )
         return windows / (time.perf_counter() - start)
 

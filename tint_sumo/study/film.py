@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from tint_sumo.config import Share, ends
+from tint_sumo.config import Share, share_words
 from tint_sumo.envs.rendering import RENDER_FPS
 from tint_sumo.errors import InputError
 from tint_sumo.files import whole_file
-from tint_sumo.progress import Report, silent
+from tint_sumo.progress import Progress, Report, silent
 from tint_sumo.scenes import OwnScene, Scene, find_scene
 from tint_sumo.scenes.layout import layout
 from tint_sumo.study.drawing import SIZE_PX, Artist
@@ -107,14 +107,13 @@ def _spread(moments: Sequence[Moment]) -> list[Moment]:
 
 def _words(share: Share | None) -> str:
     assert share is not None  # it is None in a SUMO configuration alone
-    low, high = ends(share)
-    return f"P(conservative) {low:g}" + (f" to {high:g}" if high > low else "")
+    return f"P(conservative) {share_words(share)}"
 
 
 def _frames(artist: Artist, moments: Sequence[Moment], report: Report) -> Iterator[Image.Image]:
     for done, moment in enumerate(moments, start=1):
         yield artist.frame(moment)
-        report(done, len(moments), "")
+        report(Progress(done, len(moments), "frame"))
 
 
 def _write_strip(file: Path, artist: Artist, moments: Sequence[Moment], report: Report) -> None:

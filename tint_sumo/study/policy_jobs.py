@@ -1,20 +1,19 @@
 """The study's jobs of training policies and of testing them."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import pandas as pd
 import torch
 
-from tint_sumo.config import PpoSettings, Share, ends
+from tint_sumo.config import PpoSettings, Share, ends, share_words
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_json
-from tint_sumo.progress import Report
+from tint_sumo.progress import Report, part_of
 from tint_sumo.scenes import T_INTERSECTION, AnyScene
+from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Conditions, Trials
 from tint_sumo.study.evaluation import Evaluation, evaluate
 from tint_sumo.study.loading import load_policy
@@ -44,6 +43,10 @@ class TrainJob:
         return f"train {label(self.method, self.mix, self.seed)}"
 
     @property
+    def title(self) -> Title:
+        return Title("train", self.method, share_words(self.mix), self.seed)
+
+    @property
     def needs(self) -> tuple[str, ...]:
         method = find_learned(self.method)
         traits = (f"traits {method.encoder}",) if method.encoder and not self.shipped_traits else ()
@@ -62,7 +65,6 @@ class TrainJob:
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        began = time.monotonic()
         method = find_learned(self.method)
         traits = None if self.shipped_traits else self.out / "traits" / str(method.encoder) / "model.safetensors"
         if method.trained_as is not None:
@@ -79,7 +81,7 @@ class TrainJob:
             traits=traits,
             report=report,
         )
-        return f"trained ({time.monotonic() - began:.0f} s)"
+        return ""
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,12 @@ class EvaluateJob:
         return f"evaluate {self._label}"
 
     @property
+    def title(self) -> Title:
+        if self.mix is None:
+            return Title("evaluate", self._label)
+        return Title("evaluate", self.method, share_words(self.mix), self.seed)
+
+    @property
     def _label(self) -> str:
         return label(self.method, self.mix, self.seed)
 
@@ -114,18 +122,17 @@ class EvaluateJob:
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        began = time.monotonic()
         wanted = [(one, trials.episodes) for trials in self.trials for one in trials.conditions if self._meets(one)]
         total, done = sum(episodes for _, episodes in wanted), 0
         tested: list[Measured] = []
         for conditions, episodes in wanted:
-            evaluation = self._test(conditions, episodes, partial(_shifted, report, done, total))
+            evaluation = self._test(conditions, episodes, part_of(report, done, total))
             tested.append(Measured(conditions, evaluation))
             done += episodes
         origin = GIVEN if self.mix is None else TRAINED
         write_json(self.result_file, Result(self.method, origin, self.mix, self.seed, tuple(tested)).to_json())
         successes = ", ".join(f"{one.evaluation.rate('success').value:.1%}" for one in tested)
-        return f"success {successes} ({time.monotonic() - began:.0f} s)"
+        return f"success {successes}"
 
     def _meets(self, conditions: Conditions) -> bool:
         """Whether the policy is tested there: among drivers it was trained for, and if it was trained at all."""
@@ -145,11 +152,6 @@ class EvaluateJob:
             CASES,
             report=report,
         )
-
-
-def _shifted(report: Report, before: int, total: int, done: int, _: int, note: str) -> None:
-    """Report cases under some conditions among those under all."""
-    report(before + done, total, note)
 
 
 def label(method: str, mix: Share | None, seed: int) -> str:

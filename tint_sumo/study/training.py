@@ -25,7 +25,7 @@ from tint_sumo.files import claim_folder, whole_file, write_text
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy
 from tint_sumo.policy.venv import policy_venv
-from tint_sumo.progress import Report, silent
+from tint_sumo.progress import Progress, Report, silent
 from tint_sumo.provenance import versions
 from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnScene, described, find_scene
 from tint_sumo.study.budgets import SNAPSHOTS_PERCENT
@@ -216,7 +216,7 @@ def _learn(
         if done:  # loading has set the random streams back to their beginning
             model.set_random_seed(_training_seed(seed, done))
         venv.seed(_training_seed(seed, done))
-        report(done, steps, "")
+        report(Progress(done, steps, "step"))
         watch = _Watch(out, steps, card, report)
         try:
             model.learn(steps - done, callback=watch, reset_num_timesteps=False)
@@ -306,14 +306,14 @@ class _Watch(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        note = ""
+        measures: dict[str, float] = {}
         if self._recent:
             shares = {outcome: self._recent.count(outcome) / len(self._recent) for outcome in OUTCOMES}
             for outcome, share in shares.items():
                 self.logger.record(f"rollout/{outcome}", share)
             self._curve.append([str(self.num_timesteps), *(f"{share:.4f}" for share in shares.values())])
-            note = f"success {shares['success']:.0%}, collision {shares['collision']:.0%}"
-        self._report(min(self.num_timesteps, self._steps), self._steps, note)
+            measures = {outcome: shares[outcome] for outcome in ("success", "collision")}
+        self._report(Progress(min(self.num_timesteps, self._steps), self._steps, "step", measures))
 
     def _on_training_end(self) -> None:
         self._write_curve()

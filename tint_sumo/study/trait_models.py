@@ -19,6 +19,7 @@ from tint_sumo.dataset.windows import (
     split_by_episode,
 )
 from tint_sumo.errors import InputError
+from tint_sumo.progress import Report, silent
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
 from tint_sumo.traits.figures import plot_latents, plot_reconstructions
 from tint_sumo.traits.model import find_trait_method
@@ -28,7 +29,7 @@ from tint_sumo.traits.vae import Vae
 
 
 def train_traits(
-    data: Path, out: Path, *, method: str = "vae", settings: TraitSettings, seed: int = 0, progress: bool = True
+    data: Path, out: Path, *, method: str = "vae", settings: TraitSettings, seed: int = 0, report: Report = silent
 ) -> dict[str, Any]:
     """Train a trait model on two thirds of a dataset's episodes (paper IV-B) and return its card.
 
@@ -38,14 +39,14 @@ def train_traits(
         method: a name in ``tint_sumo.traits.TRAIT_METHODS``.
         settings: sizes, loss weights and schedule.
         seed: of weights, order and noise, and of the split into training and test episodes.
-        progress: show a progress bar on stderr.
+        report: told of the progress.
 
     Raises:
         InputError: no such method, no usable dataset, a negative seed, or ``out`` holds another run.
     """
     if seed < 0:
         raise InputError(f"seed must not be negative: {seed}")
-    train_on_split(data, load_windows(data), out, method=method, settings=settings, seed=seed, progress=progress)
+    train_on_split(data, load_windows(data), out, method=method, settings=settings, seed=seed, report=report)
     return read_card(out / "model.safetensors")
 
 
@@ -58,7 +59,7 @@ def train_on_split(
     settings: TraitSettings,
     seed: int,
     latent_size: int = LATENT_SIZE,
-    progress: bool = True,
+    report: Report = silent,
 ) -> traits.TraitModel:
     """``train_traits`` on all ``windows`` of the dataset ``data``, loaded before; the trained model."""
     chosen, _ = split_by_episode(windows, TEST_FRACTION, seed)
@@ -71,7 +72,7 @@ def train_on_split(
         seed=seed,
         latent_size=latent_size,
         conservative=_first_of_two(load_labels(data, windows)[chosen], method) if uses_labels else None,
-        progress=progress,
+        report=report,
         card={"data": describe(data)},
     )
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,8 +16,9 @@ from tint_sumo.config import Share
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, write_text
 from tint_sumo.policy.storage import read_policy_card, weights_file
-from tint_sumo.progress import Report
+from tint_sumo.progress import Progress, Report, part_of
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
+from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.driving import Moment, drive_case
 from tint_sumo.study.loading import Contender, find_policy, load_policy
@@ -104,7 +104,7 @@ class Recording:
         reader, routes = fit_reader(contender), [route.name for route in find_scene(self.scene).routes]
         episodes = {}
         for done, case in enumerate(self.cases):
-            report(done, len(self.cases), f"{self.label}, case {case}")
+            report(Progress(done, len(self.cases), "case"))
             episodes[str(case)] = encode(
                 list(drive_case(contender, case, CASES, **self.conditions.world)), reader, routes
             )
@@ -125,16 +125,21 @@ class RecordJob:
     def name(self) -> str:
         return f"episodes {self.number}"
 
+    @property
+    def title(self) -> Title:
+        return Title("record", self.name)
+
     def is_done(self) -> bool:
         return all(one.is_done() for one in self.recordings)
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        began = time.monotonic()
         missing = [one for one in self.recordings if not one.is_done()]
+        total, done = sum(len(one.cases) for one in missing), 0
         for one in missing:
-            one.make(report)
-        return f"{len(missing)} policies ({time.monotonic() - began:.0f} s)"
+            one.make(part_of(report, done, total))
+            done += len(one.cases)
+        return f"policies: {len(missing)}"
 
 
 def record_all(recordings: Sequence[Recording], workers: int, progress: bool) -> None:

@@ -14,6 +14,7 @@ from torch import nn
 from tqdm import tqdm
 
 from tint_sumo.config import LATENT_SIZE, TraitSettings
+from tint_sumo.dataset.window_file import WindowFile
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file
@@ -29,7 +30,7 @@ BFLOAT16_HIDDEN_SIZE = 64  # from this size on bfloat16 is the faster one on CPU
 
 
 def train(
-    windows: Windows,
+    windows: Windows | WindowFile,
     settings: TraitSettings,
     out: Path,
     *,
@@ -63,7 +64,7 @@ def train(
         InputError: unknown method, no windows, ``out`` holds another run, or its checkpoint is damaged.
     """
     model_type = find_trait_method(method)
-    if len(windows.length) == 0:
+    if len(windows) == 0:
         raise InputError("there are no windows to train on; record a dataset with more of them")
     if model_type.uses_labels is not (conservative is not None):
         raise ValueError(f"labels are for the methods that learn with them: {method}.uses_labels")
@@ -73,7 +74,7 @@ def train(
         "seed": seed,
         "latent_size": latent_size,
         "settings": asdict(settings),
-        "windows": len(windows.length),
+        "windows": len(windows),
         "windows_sha256": _digest(windows),
     }
     with claim_folder(out, identity):
@@ -110,9 +111,8 @@ class _Run:
 
         Each epoch draws from a generator of its own, so a checkpoint needs no generator states.
         """
-        everything = WindowBatch(self.data.states, self.data.length)
-        measured = everything.with_noise(self.settings.noise_m, self._generator(0))
-        self.model.fit_features(measured.states, measured.length)
+        generator = self._generator(0)
+        self.model.fit_features(part.with_noise(self.settings.noise_m, generator) for part in self.data.parts())
         done, loss = self._resume(checkpoint)
         saved_at = time.monotonic()
         with self._bar(done, progress) as bar:
@@ -125,7 +125,7 @@ class _Run:
         return loss
 
     def _bar(self, done: int, progress: bool) -> "tqdm[NoReturn]":
-        windows = len(self.data.length)
+        windows = len(self.data)
         return make_bar(
             desc=f"traits {self.model.method}",
             total=self.settings.epochs * windows,
@@ -138,7 +138,7 @@ class _Run:
     def _run_epoch(self, epoch: int, bar: "tqdm[NoReturn]") -> dict[str, float]:
         """One pass over the shuffled windows; the mean of each loss term over the batches."""
         generator = self._generator(1 + epoch)
-        order = torch.randperm(len(self.data.length), generator=generator)
+        order = torch.randperm(len(self.data), generator=generator)
         starts = range(0, len(order), self.settings.batch_size)
         sums: dict[str, float] = {}
         for number, start in enumerate(starts):
@@ -192,7 +192,9 @@ def _stream_seed(seed: int, stream: int) -> int:
     return int(np.random.SeedSequence((seed, stream)).generate_state(1)[0])
 
 
-def _digest(windows: Windows) -> str:
-    digest = hashlib.sha256(np.ascontiguousarray(windows.states).tobytes())
-    digest.update(np.ascontiguousarray(windows.length).tobytes())
+def _digest(windows: Windows | WindowFile) -> str:
+    digest = hashlib.sha256()
+    for column in ("states", "length"):
+        for part in windows.parts():
+            digest.update(np.ascontiguousarray(getattr(part, column)).data)
     return digest.hexdigest()

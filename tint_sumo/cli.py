@@ -166,6 +166,8 @@ class TrainTraits(Command):
     """Standard deviation of the noise on every position in training, m."""
     seed: int = 0
     """Seed of the training, and of the split into training and test episodes."""
+    streaming: bool = False
+    """Keep the windows in a file beside the model instead of in memory, for large datasets; the model is the same."""
 
     def run(self) -> Outcome:
         from tint_sumo.study.budgets import TRAIT_BUDGETS
@@ -174,7 +176,9 @@ class TrainTraits(Command):
         _use_one_thread()
         require_noise(self.noise)
         settings = replace(TRAIT_BUDGETS[self.budget], noise_m=self.noise)
-        card = train_traits(self.data, self.out, method=self.method, settings=settings, seed=self.seed)
+        card = train_traits(
+            self.data, self.out, method=self.method, settings=settings, seed=self.seed, streaming=self.streaming
+        )
         return Outcome(
             f"trained {self.method} on {card['windows']} windows: {self.out}", {**card, "out": str(self.out)}
         )

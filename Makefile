@@ -1,10 +1,11 @@
-# make install | study | test | docs | net | clean. Another build of torch: make install TORCH=torch
+# make install | study | test | lint | coverage | docs | net | clean. Another build of torch: make install TORCH=torch
+# Another Python, with an environment of its own beside .venv: make test PYTHON=python3.12
 PYTHON ?= python3
-VENV ?= .venv
+VENV ?= .venv$(if $(filter-out python3,$(PYTHON)),-$(subst /,-,$(PYTHON:/%=%)))
 TORCH ?=
 BIN := $(VENV)/bin
 
-.PHONY: install study test docs net clean
+.PHONY: install study test lint coverage docs net clean
 
 install: $(VENV)/.installed
 
@@ -23,11 +24,16 @@ endif
 study: install
 	$(BIN)/tint-sumo study run --budget quick --out runs/quick
 
-test: install
+test: lint
+	$(BIN)/pytest -n 2
+
+lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest -n 2
+
+coverage: install
+	$(BIN)/pytest -n 2 --cov --cov-report=term:skip-covered
 
 docs: install
 	PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
@@ -37,4 +43,4 @@ net: install
 	$(BIN)/tint-sumo net --out sumo_net
 
 clean:
-	rm -rf runs build dist .mypy_cache .ruff_cache .pytest_cache
+	rm -rf runs build dist .coverage* .mypy_cache .ruff_cache .pytest_cache

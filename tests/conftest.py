@@ -5,8 +5,12 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from hypothesis import settings
 
 from tests.scenes.own_networks import OWN_NETWORKS, OwnNetwork
+
+settings.register_profile("tint_sumo", deadline=None)  # no test fails because the machine is busy
+settings.load_profile("tint_sumo")
 
 
 @pytest.fixture(autouse=True, scope="session")

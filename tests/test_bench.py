@@ -12,6 +12,7 @@ from tint_sumo.bench.measuring import Clocks
 from tint_sumo.bench.policies import training_speed
 from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.study.budgets import BUDGETS
+from tint_sumo.timing import StepPart, does
 from tint_sumo.traits import TRAIT_METHODS
 
 TINY_PPO = replace(BUDGETS["full"].ppo, n_envs=4, n_steps=3, n_minibatches=2)
@@ -27,7 +28,6 @@ TINY = Sizes(
     decisions=3,
     memory_env_steps=(12, 24),
 )
-PARTS = {"sumo", "getters", "spawning", "claims", "safety_check", "observation", "adapter", "other"}
 
 
 @pytest.mark.slow
@@ -59,7 +59,7 @@ def test_the_benchmark_measures_everything() -> None:
     for cores in printed["cores"]:
         assert cores.keys() == {"replicas", "one", "two", "ratio"}
         assert min(cores.values()) > 0.0
-    assert printed["breakdown_us"].keys() == PARTS
+    assert list(printed["breakdown_us"]) == list(StepPart)
     speeds = [printed[key] for key in printed if key.endswith("steps_per_s")]
     assert min(speeds + list(printed["breakdown_us"].values())) > 0.0
     for key in ("train_decisions_per_s", "recurrent_ppo_decisions_per_s", "train_to_recurrent_ppo", "decision_ms"):
@@ -72,8 +72,8 @@ def test_the_benchmark_measures_everything() -> None:
     assert printed["windows"] >= 20
     assert printed["peak_rss_mib"] > 50.0  # three Pythons
     table = found.table()
-    assert all(part in table for part in PARTS)
-    assert "clocks around the named functions" in table
+    assert all(part in table for part in StepPart)
+    assert "clocks around the functions that do these parts" in table
     assert "our speed to its" in table
     assert "trait inference at every simulation step" in table
     alone = replace(found, recurrent_ppo_decisions_per_s=None, train_to_recurrent_ppo=None).table()
@@ -95,12 +95,14 @@ class Work:
     def __init__(self) -> None:
         self.now_s = 0.0
 
+    @does(StepPart.OTHER)
     def outer(self) -> str:
         self.now_s += 1.0
         self.inner()
         self.inner()
         return "done"
 
+    @does(StepPart.SUMO)
     def inner(self) -> None:
         self.now_s += 10.0
 
@@ -109,7 +111,18 @@ def test_time_in_a_watched_method_counts_once(monkeypatch: pytest.MonkeyPatch) -
     work = Work()
     monkeypatch.setattr("time.perf_counter", lambda: work.now_s)
     clocks = Clocks()
-    clocks.watch(work, "outer", "outer")
-    clocks.watch(work, "inner", "inner")
+    clocks.watch(work)
     assert work.outer() == "done"
-    assert (clocks.spent_s["outer"], clocks.spent_s["inner"]) == (1.0, 20.0)
+    assert (clocks.spent_s[StepPart.OTHER], clocks.spent_s[StepPart.SUMO]) == (1.0, 20.0)
+
+
+def test_a_marked_method_costs_nothing_until_it_is_watched() -> None:
+    """A mark wraps nothing, and clocks are put around the methods of the watched objects alone."""
+
+    def step() -> None:
+        pass
+
+    assert does(StepPart.OTHER)(step) is step
+    watched, other = Work(), Work()
+    Clocks().watch(watched)
+    assert vars(watched).keys() - vars(other).keys() == {"outer", "inner"}

@@ -1,12 +1,18 @@
 """The package as users install it."""
 
 import ast
+import os
+import re
 import subprocess
 import sys
+import sysconfig
+import venv
 import zipfile
 from pathlib import Path
 
 import pytest
+
+import tint_sumo
 
 ROOT = Path(__file__).parents[1]
 
@@ -30,27 +36,49 @@ def test_the_wheel_holds_network_models_and_type_marker(wheel: Path) -> None:
     assert not [name for name in names if name.endswith(".pth")]  # nothing runs when Python starts
 
 
-def test_an_installed_wheel_works_away_from_the_checkout(wheel: Path, tmp_path: Path) -> None:
-    """As site-packages would hold it, with the dependencies of this environment."""
-    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
-    code = f"""
-import sys
-sys.path = [path for path in sys.path if path != {str(ROOT)!r}]
-for name in [name for name in sys.modules if name.split(".")[0] == "tint_sumo"]:
-    del sys.modules[name]
-sys.path.insert(0, {str(tmp_path / "site")!r})
+def test_the_wheel_works_in_a_fresh_environment(wheel: Path, tmp_path: Path) -> None:
+    """Started in an empty folder; the dependencies alone are those of this environment."""
+    fresh, empty = tmp_path / "fresh", tmp_path / "empty"
+    empty.mkdir()
+    venv.create(fresh)
+    python = fresh / "bin" / "python"
+    pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps"]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    subprocess.run([*pip, str(wheel)], env=environment, check=True)
+    (site,) = fresh.glob("lib/python*/site-packages")
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    code = """
 import gymnasium
 env = gymnasium.make("tint_sumo:tint_sumo/TIntersection-v1")
 env.reset(seed=0)
+env.step(2)
 import tint_sumo.files, tint_sumo.traits
-assert tint_sumo.__file__.startswith({str(tmp_path)!r}), tint_sumo.__file__
-assert str(tint_sumo.files.shipped("models")).startswith({str(tmp_path)!r})
 assert (tint_sumo.files.shipped("sumo_net") / "tint.net.xml").exists()
-print(tint_sumo.traits.load("vae").latent_size)
+print(tint_sumo.__file__, tint_sumo.files.shipped("models"), tint_sumo.traits.load("vae").latent_size)
 """
-    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.strip() == "2"
+    for command, expected in (
+        ([str(fresh / "bin" / "tint-sumo"), "--help"], "usage: tint-sumo"),
+        ([str(python), "-c", code], f"{site}/tint_sumo/__init__.py {site}/tint_sumo/shipped/models 2"),
+    ):
+        result = subprocess.run(command, cwd=empty, env=environment, capture_output=True, text=True, check=False)
+        assert result.returncode == 0, result.stderr
+        assert result.stdout.startswith(expected)
+    assert not list(empty.iterdir())
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    version = tint_sumo.__version__
+    assert f"\nversion: {version}\n" in citation
+    assert f"\n## [{version}] - 2" in changes or f"\nThis will be version {version}" in changes
+
+
+def test_pre_commit_runs_the_linters_of_the_makefile() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (lint,) = re.findall(r"^lint: install\n((?:\t.+\n)+)", makefile, re.MULTILINE)
+    hooks = re.findall(r"^ +entry: (.+)$", (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert hooks == [line.strip().replace("$(BIN)", ".venv/bin") for line in lint.splitlines()]
 
 
 def test_importing_the_package_loads_no_more_than_gymnasium() -> None:
@@ -61,14 +89,14 @@ def test_importing_the_package_loads_no_more_than_gymnasium() -> None:
 
 def test_floors_import_downwards_only() -> None:
     floors = [
-        "compiling config errors files processes progress",
+        "compiling config errors files job_table processes progress provenance standings structures timing yaml_files",
         "scenes",
         "simulation",
         "envs dataset",
         "traits",
         "policy",
         "study",
-        "bench",
+        "bench configuration",
         "cli",
     ]
     floor_of = {name: level for level, names in enumerate(floors) for name in names.split()}

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from tests.terminal import look, open_terminal
-from tint_sumo.progress import make_bar, progress_bar
+from tint_sumo.progress import Progress, make_bar, part_of, progress_bar
 
 
 def work() -> None:
@@ -36,16 +36,22 @@ def test_on_a_terminal_it_moves(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_nothing_is_shown_before_the_first_report(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress_bar("work", "step"):
+    with progress_bar("work"):
         pass
     assert capsys.readouterr().err == ""
 
 
 def test_the_bar_ends_where_the_work_does(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress_bar("work", "step") as report:
+    with progress_bar("work") as report:
         for done in (20, 50, 100):
-            report(done, 100, f"reached {done}")
+            report(Progress(done, 100, "step", {"success": done / 100, "loss": 1 / 3}))
     shown = capsys.readouterr().err
     assert "work:  20%" in shown
     assert "100/100" in shown
-    assert "reached 100" in shown
+    assert "success 100%, loss 0.333" in shown
+
+
+def test_a_part_of_some_work_counts_from_where_it_begins() -> None:
+    told: list[Progress] = []
+    part_of(told.append, 30, 200)(Progress(5, 10, "case", {"success": 1.0}))
+    assert told == [Progress(35, 200, "case", {"success": 1.0})]

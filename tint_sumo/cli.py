@@ -1,11 +1,14 @@
 """The ``tint-sumo`` command. Each command is a dataclass whose fields are its flags."""
 
+import io
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
 
 import tyro
 from tyro.conf import (
@@ -19,23 +22,31 @@ from tyro.conf import (
 )
 
 from tint_sumo import ENV_IDS
+from tint_sumo.configuration import (
+    FromFile,
+    commands_named,
+    config_of,
+    name_flag,
+    one_of,
+    read_command,
+    write_command,
+)
 from tint_sumo.errors import InputError
+from tint_sumo.provenance import Origin, made_by
+from tint_sumo.structures import Where
 
 if TYPE_CHECKING:
     from tint_sumo.config import Share
+    from tint_sumo.study.loading import Contender
     from tint_sumo.study.report import StudyReport
 
 # What a command needs is imported when it runs: --help shall not wait for torch and SUMO.
 # ruff: noqa: PLC0415
 
-BudgetName = Literal["quick", "full", "paper"]
 ShareFlag = tuple[float, ...]  # one probability, or the two ends of a range
-PopulationName = Literal["traits", "continuous"]
 _SCENES = ", ".join(ENV_IDS)
-SceneName = Annotated[str, arg(help=f"Scene: {_SCENES}.")]
-TraitBudgetName = Literal["quick", "full", "paper"]
-
-_MADE = ("dataset", "traits/*/latent.png", "policies/*/policy.safetensors")  # in a study's folder
+Shell = Literal["bash", "zsh", "tcsh"]
+_TYRO = (OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff)
 RESUMES = ", the same command goes on from here"
 
 
@@ -53,26 +64,82 @@ class Command:
 
     json: bool = False
     """Print one JSON object as the last line of stdout."""
+    config: Path | None = None
+    """YAML file with values of these flags, named as here but with underscores; flags that are given here win. A scene,
+    a budget or a population can be a mapping there: of its base, and the numbers that differ."""
+    print_config: bool = False
+    """Print all values as such a file, and do nothing else."""
 
     def run(self) -> Outcome:
         raise NotImplementedError
+
+
+# What is a name among the flags can be defined in a configuration file.
+
+
+def _read_scene(value: Any, where: Where = ()) -> Any:
+    from tint_sumo.scenes import ALL_SCENES, read_scene
+
+    return value if value in (None, ALL_SCENES) else read_scene(value, where)
+
+
+def _scene_in_full(value: Any) -> Any:
+    from tint_sumo.scenes import ALL_SCENES, scene_settings
+
+    return value if value in (None, ALL_SCENES) else scene_settings(value)
+
+
+def _read_population(value: Any, where: Where) -> Any:
+    from tint_sumo.config import Population, population_name
+
+    if value is None:
+        return None
+    population = Population.from_file(value, where)
+    return population_name(population) or population
+
+
+def _population_in_full(value: Any) -> Any:
+    from tint_sumo.config import find_population
+
+    return find_population(value) if isinstance(value, str) else value
+
+
+_SCENE = FromFile(_read_scene, _scene_in_full)
+_POPULATION = FromFile(_read_population, _population_in_full)
+_BUDGET = one_of("tint_sumo.study.budgets", "BUDGETS", "quick")
+_PPO_BUDGET = one_of("tint_sumo.study.budgets", "PPO_BUDGETS", "full")
+_TRAIT_BUDGET = one_of("tint_sumo.study.budgets", "TRAIT_BUDGETS", "quick")
+_TRAIT_STUDY = one_of("tint_sumo.study.trait_study", "TRAIT_STUDIES", "full")
+_SCENE_STUDY = one_of("tint_sumo.study.scene_study", "SCENE_STUDIES", "full")
+
+# Values are names, or what these make of a file.
+SceneValue = Annotated[Any, name_flag(), _SCENE]
+PopulationValue = Annotated[Any, name_flag("traits", "continuous"), _POPULATION]
+BudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), _BUDGET]
+PpoBudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), _PPO_BUDGET]
+TraitBudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), _TRAIT_BUDGET]
+TraitStudyValue = Annotated[Any, name_flag("full"), _TRAIT_STUDY]
+SceneStudyValue = Annotated[Any, name_flag("full"), _SCENE_STUDY]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Net(Command):
     """Build a scene's road network, the drivers and plain SUMO's configuration with netconvert."""
 
-    scene: SceneName = "t_intersection"
+    scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
     replicas: int = 1
     """Number of intersections in the network."""
     out: Path = Path("sumo_net")
     """Folder for the files; files of the same names are replaced if this command wrote them."""
 
     def run(self) -> Outcome:
-        from tint_sumo.scenes import find_scene
+        from tint_sumo.scenes import Scene, find_scene
         from tint_sumo.scenes.build import CONFIG_FILE, write_scene
 
-        files = write_scene(self.out, find_scene(self.scene), self.replicas)
+        scene = find_scene(self.scene)
+        if not isinstance(scene, Scene):
+            raise InputError(f"scene {scene.name} has SUMO's files already")
+        files = write_scene(self.out, scene, self.replicas)
         text = f"wrote {len(files)} files to {self.out}; run them with: sumo -c {self.out / CONFIG_FILE}"
         return Outcome(text, {"replicas": self.replicas, "files": [str(file) for file in files]})
 
@@ -89,11 +156,12 @@ class Record(Command):
     """At least so many windows of up to 20 steps of 0.1 s."""
     p_conservative: ShareFlag = (0.5,)
     """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
-    population: PopulationName = "traits"
-    """traits: conservative and aggressive drivers; continuous: desired speeds and gaps without classes."""
+    population: PopulationValue = None
+    """traits: conservative and aggressive drivers; continuous: desired speeds and gaps without classes; the scene's
+    drivers, traits in all that are built in, if not given."""
     seed: int = 0
     """Seed of the traffic."""
-    scene: SceneName = "t_intersection"
+    scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
     workers: int = 1
     """Processes that simulate; the dataset does not depend on their number."""
     format: Literal["parquet", "fcd"] = "parquet"
@@ -104,10 +172,12 @@ class Record(Command):
     def run(self) -> Outcome:
         from tint_sumo.dataset.own_recorder import record_sumocfg
         from tint_sumo.dataset.recorder import record
+        from tint_sumo.scenes import OwnScene
 
-        if self.sumocfg is not None:
+        sumocfg = self.scene.config.file if isinstance(self.scene, OwnScene) else self.sumocfg
+        if sumocfg is not None:
             self._require_nothing_but_the_configuration()
-            manifest = record_sumocfg(self.sumocfg, self.out, self.windows, seed=self.seed, workers=self.workers)
+            manifest = record_sumocfg(sumocfg, self.out, self.windows, seed=self.seed, workers=self.workers)
             return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
         manifest = record(
             self.out,
@@ -122,10 +192,15 @@ class Record(Command):
         return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
 
     def _require_nothing_but_the_configuration(self) -> None:
-        for flag in ("p_conservative", "population", "scene", "format"):
+        flags = ["p_conservative", "population", "format"]
+        other = "the sumocfg of a scene"
+        if self.sumocfg is not None:
+            flags.append("scene")
+            other = "--sumocfg"
+        for flag in flags:
             if getattr(self, flag) != getattr(Record, flag):
                 name = flag.replace("_", "-")
-                raise InputError(f"--{name} does not go with --sumocfg, which tells all of the traffic; leave it out")
+                raise InputError(f"--{name} does not go with {other}, which tells all of the traffic; leave it out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,7 +235,7 @@ class TrainTraits(Command):
     """Folder for the model."""
     method: str = "vae"
     """vae (the paper's), cross_window and morton learn without labels, classifier with them."""
-    budget: TraitBudgetName = "quick"
+    budget: TraitBudgetValue = "quick"
     """quick: for about 30,000 windows; full: for some 700,000; paper: the paper's network and 1000 epochs."""
     noise: float = 0.0
     """Standard deviation of the noise on every position in training, m."""
@@ -170,15 +245,23 @@ class TrainTraits(Command):
     """Keep the windows in a file beside the model instead of in memory, for large datasets; the model is the same."""
 
     def run(self) -> Outcome:
-        from tint_sumo.study.budgets import TRAIT_BUDGETS
+        from tint_sumo.job_table import one_job
+        from tint_sumo.standings import Title
         from tint_sumo.study.trait_models import require_noise, train_traits
 
         _use_one_thread()
         require_noise(self.noise)
-        settings = replace(TRAIT_BUDGETS[self.budget], noise_m=self.noise)
-        card = train_traits(
-            self.data, self.out, method=self.method, settings=settings, seed=self.seed, streaming=self.streaming
-        )
+        settings = replace(_TRAIT_BUDGET.full(self.budget), noise_m=self.noise)
+        with one_job(Title("traits", self.method, seed=self.seed)) as report:
+            card = train_traits(
+                self.data,
+                self.out,
+                method=self.method,
+                settings=settings,
+                seed=self.seed,
+                streaming=self.streaming,
+                report=report,
+            )
         return Outcome(
             f"trained {self.method} on {card['windows']} windows: {self.out}", {**card, "out": str(self.out)}
         )
@@ -277,13 +360,15 @@ class StudyTraits(Command):
 
     out: Path = Path("runs/traits")
     """Folder of the comparison."""
+    budget: TraitStudyValue = "full"
+    """Sizes of all stages; others can be given in a configuration file."""
     workers: int = 2
     """Processes at a time."""
 
     def run(self) -> Outcome:
-        from tint_sumo.study.trait_study import TraitStudy, run_trait_study
+        from tint_sumo.study.trait_study import run_trait_study
 
-        report = run_trait_study(TraitStudy(), self.out, workers=self.workers)
+        report = run_trait_study(_TRAIT_STUDY.full(self.budget), self.out, workers=self.workers)
         files = [str(file) for file in (report.csv_file, report.markdown_file, report.figure_file)]
         text = "\n".join([report.markdown, *(f"wrote {file}" for file in files)])
         return Outcome(text, {"results": report.table.to_dict("records"), "files": files})
@@ -305,9 +390,9 @@ class TrainPolicy(Command):
     """Decisions of the policy; those of the budget if not given."""
     seed: int = 0
     """Seed of the training, 0 to 1000."""
-    budget: BudgetName = "full"
+    budget: PpoBudgetValue = "full"
     """Sizes of the network, settings of PPO and number of decisions. full takes 5 to 8 minutes on a free core."""
-    scene: Annotated[str, arg(help=f"Scene: {_SCENES}, or all of them at once: all.")] = "t_intersection"
+    scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}, or all of them at once: all.")] = "t_intersection"
     traits: str | None = None
     """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file; the
     shipped one of the method if not given."""
@@ -317,17 +402,22 @@ class TrainPolicy(Command):
     """Write the policy as Stable-Baselines3's policy.zip, too. That is a pickle: others must trust you to read it."""
 
     def run(self) -> Outcome:
-        from tint_sumo.progress import progress_bar
-        from tint_sumo.study.budgets import find_budget
+        from tint_sumo.config import share_words
+        from tint_sumo.job_table import one_job
+        from tint_sumo.scenes import OwnScene
+        from tint_sumo.standings import Title
         from tint_sumo.study.training import train_policy
 
         _use_one_thread()
-        settings = find_budget(self.budget).ppo
+        is_own = isinstance(self.scene, OwnScene) and self.p_conservative == TrainPolicy.p_conservative
+        settings = _PPO_BUDGET.full(self.budget)
         steps = settings.total_steps if self.steps is None else self.steps
-        with progress_bar(f"policy {self.method}", "step") as report:
+        share = None if is_own else _share(self.p_conservative)
+        mix = "" if share is None else share_words(share)
+        with one_job(Title("train", self.method, mix, self.seed)) as report:
             policy = train_policy(
                 self.method,
-                _share(self.p_conservative),
+                share,
                 steps,
                 self.seed,
                 self.out,
@@ -352,12 +442,12 @@ class EvaluatePolicy(Command):
     p_conservative: ShareFlag | None = None
     """Probability that a driver is conservative, 0 to 1, or two numbers between which each case draws its own; those
     of the policy's training if not given."""
-    scene: str | None = None
+    scene: SceneValue = None
     """Scene; the one the policy was trained in if not given, for always_go and ttc t_intersection."""
     noise: float = 0.0
     """Standard deviation of the noise on the others' positions, m."""
-    tau: float = 1.0
-    """Time headway of the other drivers, s."""
+    tau: float | None = None
+    """Time headway of the other drivers, s; the scene's if not given, 1 s in all that are built in."""
     episodes: int = 500
     """Number of cases."""
     seed: int = 0
@@ -373,9 +463,8 @@ class EvaluatePolicy(Command):
 
         _use_one_thread()
         contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
-        p_conservative = contender.p_conservative if self.p_conservative is None else _share(self.p_conservative)
-        world = {"p_conservative": p_conservative, "position_noise_m": self.noise, "tau_s": self.tau}
-        with progress_bar(self.model, "case") as report:
+        world = _world(contender, self.p_conservative, self.noise, self.tau)
+        with progress_bar(self.model) as report:
             evaluation = evaluate(
                 contender.policy,
                 lambda num_envs: contender.make_venv(num_envs, **world),
@@ -390,8 +479,8 @@ class EvaluatePolicy(Command):
         ]
         time_s = evaluation.navigation_time_s
         lines.append("no success" if time_s is None else f"navigation time {time_s:.1f} s")
-        content = {"model": self.model, "scene": contender.scene, **world, "seed": self.seed, **evaluation.summary()}
-        return Outcome("\n".join(lines), content)
+        place = {"model": self.model, "scene": contender.scene_name, **world}
+        return Outcome("\n".join(lines), {**place, "seed": self.seed, **evaluation.summary()})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -400,20 +489,21 @@ class RunStudy(Command):
 
     after_interrupt: ClassVar[str] = RESUMES
 
-    budget: BudgetName = "quick"
+    budget: BudgetValue = "quick"
     """quick: minutes, few decisions. full: all methods, four seeds, three hours. paper: all numbers as in the paper,
     days."""
     out: Path | None = None
     """Folder of the study; runs/<budget> if not given."""
+    scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
     workers: int = 2
     """Processes at a time."""
 
     def run(self) -> Outcome:
-        from tint_sumo.study.budgets import find_budget
         from tint_sumo.study.grid import run_study
 
-        out = Path("runs") / self.budget if self.out is None else self.out
-        outcome = _report_outcome(run_study(find_budget(self.budget), out, workers=self.workers))
+        out = self._folder()
+        report = run_study(_BUDGET.full(self.budget), out, scene=self.scene, workers=self.workers)
+        outcome = _report_outcome(report)
         made = [
             out / "dataset",
             *sorted(out.glob("traits/*/latent.png")),
@@ -422,18 +512,26 @@ class RunStudy(Command):
         lines = "\n".join(f"wrote {path}" for path in made)
         return Outcome(f"{outcome.text}\n{lines}", {**outcome.content, "made": [str(path) for path in made]})
 
+    def _folder(self) -> Path:
+        if self.out is not None:
+            return self.out
+        if not isinstance(self.budget, str):
+            raise InputError("a budget of your own needs a folder of its own; say --out FOLDER")
+        return Path("runs") / self.budget
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReportStudy(Command):
-    """Make a study's results table and figure again."""
+    """Make a study's tables, figures and page again; the page's episodes are recorded if they are not there."""
 
     out: Path = Path("runs/quick")
     """Folder of the study."""
 
     def run(self) -> Outcome:
+        from tint_sumo.study.page import write_page
         from tint_sumo.study.report import write_report
 
-        return _report_outcome(write_report(self.out))
+        return _report_outcome(write_page(write_report(self.out), self.out))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -444,13 +542,15 @@ class StudyScenes(Command):
 
     out: Path = Path("runs/scenes")
     """Folder of the comparison."""
+    budget: SceneStudyValue = "full"
+    """Sizes of all stages; others can be given in a configuration file."""
     workers: int = 2
     """Processes at a time."""
 
     def run(self) -> Outcome:
-        from tint_sumo.study.scene_study import SceneStudy, report_markdown, run_scene_study
+        from tint_sumo.study.scene_study import report_markdown, run_scene_study
 
-        table = run_scene_study(SceneStudy(), self.out, workers=self.workers)
+        table = run_scene_study(_SCENE_STUDY.full(self.budget), self.out, workers=self.workers)
         files = [str(self.out / "scenes.csv"), str(self.out / "scenes.md")]
         text = "\n".join([report_markdown(table), *(f"wrote {file}" for file in files)])
         return Outcome(text, {"results": table.to_dict("records"), "files": files})
@@ -472,12 +572,12 @@ class Render(Command):
     """Number of the case; the same cases as in policy evaluate."""
     seed: int = 0
     """Which set of cases, 0 to 1000."""
-    scene: str | None = None
+    scene: SceneValue = None
     """Scene; the one the policy was trained in if not given, for always_go and ttc t_intersection."""
     noise: float = 0.0
     """Standard deviation of the noise on the others' positions, m; the film shows where they are."""
-    tau: float = 1.0
-    """Time headway of the other drivers, s."""
+    tau: float | None = None
+    """Time headway of the other drivers, s; the scene's if not given, 1 s in all that are built in."""
     allow_pickle: bool = False
     """Read .zip files, which can run any code: only for files you trust."""
 
@@ -488,12 +588,11 @@ class Render(Command):
 
         _use_one_thread()
         contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
-        share = contender.p_conservative if self.p_conservative is None else _share(self.p_conservative)
-        world = {"p_conservative": share, "position_noise_m": self.noise, "tau_s": self.tau}
-        with progress_bar(str(self.out), "frame") as report:
+        world = _world(contender, self.p_conservative, self.noise, self.tau)
+        with progress_bar(str(self.out)) as report:
             film = render_case(contender, self.case, self.out, seed=self.seed, report=report, **world)
         text = f"{film.outcome} after {film.time_s:.1f} s, {film.frames} frames: {self.out}"
-        content = {"model": self.model, "scene": contender.scene, **world, "case": self.case, "seed": self.seed}
+        content = {"model": self.model, "scene": contender.scene_name, **world, "case": self.case, "seed": self.seed}
         return Outcome(text, {**content, "out": str(self.out), **asdict(film)})
 
 
@@ -550,9 +649,13 @@ class Study:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TintSumo:
     """Driving among strangers: driver-trait inference and intersection navigation on Eclipse SUMO."""
+
+    print_completion: Shell | None = None
+    """Print a script that completes commands and flags in that shell, and do nothing else. For bash, put this line into
+    ~/.bashrc: eval "$(tint-sumo --print-completion bash)"."""
 
     command: (
         Annotated[Net, subcommand("net")]
@@ -568,16 +671,19 @@ class TintSumo:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit code is 0, 2 after bad input, or 130 after an interruption."""
-    parsed: Any = tyro.cli(
-        TintSumo,
-        prog="tint-sumo",
-        args=argv,
-        config=(OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff),
-    )
-    while not isinstance(parsed, Command):
-        parsed = parsed.command
+    words = list(sys.argv[1:] if argv is None else argv)
+    after_interrupt = Command.after_interrupt
+    if words[:1] == ["--print-completion"] and words[1:] in ([shell] for shell in get_args(Shell)):
+        print(_completion_script(words[1]), end="")
+        return 0
     try:
-        outcome = parsed.run()
+        command = parse(words)
+        after_interrupt = command.after_interrupt
+        if command.print_config:
+            print(write_command(command), end="")
+            return 0
+        with made_by(Origin(tuple(words), partial(write_command, command))):
+            outcome = command.run()
     except InputError as error:
         print(f"tint-sumo: error: {error}", file=sys.stderr)
         return 2
@@ -587,12 +693,54 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"tint-sumo: error: {error.filename}: {error.strerror}; check the path", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("\ntint-sumo: interrupted; all files are whole" + parsed.after_interrupt, file=sys.stderr)
+        print("\ntint-sumo: interrupted; all files are whole" + after_interrupt, file=sys.stderr)
         return 130
     print(outcome.text)
-    if parsed.json:
+    if command.json:
         print(json.dumps(outcome.content))
     return 0
+
+
+def parse(words: list[str]) -> Command:
+    """The command that the words of a command line say, with what its configuration file says.
+
+    Raises:
+        InputError: the file is not there, or a value in it does not fit.
+    """
+    file = config_of(words)
+    *groups, kind = commands_named(TintSumo, words)
+    if file is None or not issubclass(kind, Command):
+        parsed: Any = tyro.cli(TintSumo, prog="tint-sumo", args=words, config=_TYRO)
+    else:
+        default: Any = read_command(kind, file)
+        for group in reversed(groups):
+            default = group(command=default)
+        with_pairs = [one for one in _TYRO if one is not FlagCreatePairsOff]  # --no-json where the file has json: true
+        parsed = tyro.cli(TintSumo, prog="tint-sumo", args=words, default=default, config=with_pairs)
+    while not isinstance(parsed, Command):
+        parsed = parsed.command
+    return parsed
+
+
+def _completion_script(shell: str) -> str:
+    """A script that a shell reads; it holds all commands and flags, and does not need this package."""
+    script = io.StringIO()
+    with redirect_stdout(script), suppress(SystemExit):
+        tyro.cli(TintSumo, prog="tint-sumo", args=["--tyro-print-completion", shell], config=_TYRO)
+    # The script offers each line of a help text as a word of its own.
+    lines = script.getvalue().splitlines(keepends=True)
+    return "".join(one.replace("\\n", " ") if one.startswith("COMPLETION_SPEC") else one for one in lines)
+
+
+def _world(
+    contender: "Contender", p_conservative: ShareFlag | None, noise_m: float, tau_s: float | None
+) -> dict[str, Any]:
+    """Where a policy is evaluated: what is not given is that of its training."""
+    return {
+        "p_conservative": contender.p_conservative if p_conservative is None else _share(p_conservative),
+        "position_noise_m": noise_m,
+        "tau_s": contender.tau_s if tau_s is None else tau_s,
+    }
 
 
 def _share(numbers: ShareFlag) -> "Share":
@@ -610,7 +758,7 @@ def _use_one_thread() -> None:
 
 
 def _report_outcome(report: "StudyReport") -> Outcome:
-    files = [report.csv_file, report.markdown_file, *report.figure_files]
+    files = [report.csv_file, report.markdown_file, *report.figure_files, report.page_file]
     text = "\n".join([report.markdown, *(f"wrote {file}" for file in files)])
     return Outcome(text, {"results": [row.to_json() for row in report.rows], "files": [str(file) for file in files]})
 

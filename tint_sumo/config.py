@@ -4,11 +4,13 @@ Sources: "paper" is Liu et al., Learning to Navigate Intersections with Unsuperv
 "code" is the authors' published code, used where the paper gives no value; "SUMO" is Eclipse SUMO's default.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from tint_sumo.errors import InputError
+from tint_sumo.structures import FieldError, Where, build, choose
 
 NO_LEADER_GAP_M = 20.0  # stands for the gap of every driver without a leader, whatever its trait, and caps all gaps
 MIN_WINDOW_STEPS = 2  # of a window; a single step has no motion
@@ -17,11 +19,35 @@ WINDOW_STEPS = 20  # steps from which a trait is inferred, and between two infer
 LATENT_SIZE = 2  # numbers that represent a trait (paper III-B)
 P_CONSERVATIVE = (0.25, 0.4, 0.6)  # driver mixes of the paper's experiments (paper Fig. 4)
 
+MOST_PROFILES = 127  # labels are numbers of one byte
+
 POSITION_SCALE_M = 20.0  # positions are observed divided by this (code)
 SPEED_SCALE_MPS = 3.0  # velocities are observed divided by this: the ego's top desired speed
 
 Backend = Literal["auto", "libsumo", "traci"]
 Share = float | tuple[float, float]  # a probability, or the range it is drawn from
+
+
+def require_positive(owner: object, *names: str) -> None:
+    """Raise InputError unless these fields are above 0."""
+    for name in names:
+        if not getattr(owner, name) > 0:
+            raise InputError(f"{name} must be above 0, not {getattr(owner, name)}")
+
+
+def require_at_least(owner: object, lowest: float, *names: str) -> None:
+    """Raise InputError unless these fields, or all items of those that are tuples, are not below ``lowest``."""
+    for name in names:
+        value = getattr(owner, name)
+        if not all(one >= lowest for one in (value if isinstance(value, tuple) else (value,))):
+            raise InputError(f"{name} must be at least {lowest:g}, not {value}")
+
+
+def require_fraction(owner: object, *names: str) -> None:
+    """Raise InputError unless these fields lie in [0, 1]."""
+    for name in names:
+        if not 0.0 <= getattr(owner, name) <= 1.0:
+            raise InputError(f"{name} must lie in 0 to 1, not {getattr(owner, name)}")
 
 
 @dataclass(frozen=True)
@@ -41,6 +67,19 @@ class DriverProfile:
     yields: bool  # whether the driver reacts to an ego that claims its lane (paper IV-A)
     colour: str  # of the vehicle in figures and in sumo-gui, "r,g,b"
     weight: float = 1.0  # share among the profiles that yield as this one does, to the accuracy of whole vTypes
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z]\w*", self.name):
+            raise InputError(f"name must be of letters, digits and underscores, a letter first, not {self.name!r}")
+        for name in ("desired_speed_mps", "min_gap_m", "entry_gap_m"):
+            low, high = getattr(self, name)
+            if not 0.0 <= low <= high:
+                raise InputError(f"{name} must be two numbers from low to high, 0 or more, not {low:g} and {high:g}")
+        if self.desired_speed_mps[0] == 0.0:
+            raise InputError("desired_speed_mps must be above 0: nobody would come")
+        if not re.fullmatch(r"\d+,\d+,\d+", self.colour) or max(map(int, self.colour.split(","))) > 255:
+            raise InputError(f'colour must be "red,green,blue", each 0 to 255, not {self.colour!r}')
+        require_positive(self, "weight")
 
     @property
     def rgb(self) -> tuple[float, float, float]:
@@ -66,6 +105,14 @@ class Idm:
     tau_s: float = 1.0  # SUMO; the paper gives none, the code has 1.5
     delta: float = 4.0  # code
 
+    def __post_init__(self) -> None:
+        require_positive(self, "accel_mps2", "decel_mps2", "emergency_decel_mps2", "delta")
+        if self.emergency_decel_mps2 < self.decel_mps2:
+            raise InputError(
+                f"emergency_decel_mps2 must be at least decel_mps2 ({self.decel_mps2:g}), "
+                f"not {self.emergency_decel_mps2:g}"
+            )
+
 
 @dataclass(frozen=True)
 class Population:
@@ -76,14 +123,61 @@ class Population:
     seed: int = 2022  # of the draws
     idm: Idm = Idm()
 
+    def __post_init__(self) -> None:
+        names = [profile.name for profile in self.profiles]
+        if not 1 <= len(names) <= MOST_PROFILES:
+            raise InputError(f"profiles must be 1 to {MOST_PROFILES}, not {len(names)}")
+        if len(set(names)) < len(names):
+            raise InputError(f"profiles must have names of their own, not {', '.join(names)}")
+        require_at_least(self, 1, "members")
+        require_at_least(self, 0, "seed")
+
+    @classmethod
+    def from_file(cls, value: Any, where: Where = ()) -> "Population":
+        """What a file means by a population: a name, a list of profiles, or what differs from its ``base``.
+
+        Raises:
+            FieldError: a value does not fit.
+        """
+        if not isinstance(value, list):
+            chosen = choose(value, POPULATIONS, "traits", where)
+            return POPULATIONS[chosen] if isinstance(chosen, str) else chosen
+        profiles = build(tuple[DriverProfile, ...], value, where)
+        try:
+            return cls(profiles)
+        except InputError as error:
+            raise FieldError(where, str(error)) from None
+
 
 POPULATIONS = {"traits": Population(), "continuous": Population((CONTINUOUS,), members=512)}
+
+
+def find_population(name: str) -> Population:
+    """The population called ``name``.
+
+    Raises:
+        InputError: there is none.
+    """
+    if name not in POPULATIONS:
+        raise InputError(f"unknown population {name!r}; choose one of: {', '.join(POPULATIONS)}")
+    return POPULATIONS[name]
+
+
+def population_name(population: Population) -> str | None:
+    """What a population is called, if it is one that has a name."""
+    return next((name for name, known in POPULATIONS.items() if known == population), None)
 
 
 def ends(share: Share) -> tuple[float, float]:
     """Both ends of a range; twice the same for a number."""
     low, high = share if isinstance(share, Sequence) else (share, share)
     return float(low), float(high)
+
+
+def share_words(share: Share) -> str:
+    """A share for people to read."""
+    low, high = ends(share)
+    return f"{low:g}" + (f" to {high:g}" if high > low else "")
 
 
 def is_share(value: object) -> bool:
@@ -141,6 +235,12 @@ class EgoController:
     braking_gain_per_s: float = 5.0
     braking_limit_mps2: float = 6.0
 
+    def __post_init__(self) -> None:
+        if len(self.desired_speeds_mps) < 2:
+            raise InputError("desired_speeds_mps must be at least two speeds, the first one slow enough to wait")
+        require_at_least(self, 0, "desired_speeds_mps", "unsafe_distance_m", "closing_distance_m", "closing_speed_mps")
+        require_positive(self, "gain_per_s", "accel_limit_mps2", "braking_gain_per_s", "braking_limit_mps2")
+
 
 @dataclass(frozen=True)
 class Claim:
@@ -159,6 +259,10 @@ class Claim:
     courtesy_gap_m: float = 1.5  # that yielding drivers add to their minGap while their lane is claimed
     reaction_time_s: float = 0.1  # before a driver brakes: a step
     braking_mps2: float = 6.0  # that a driver is ready for: hard, but below the 9 m/s2 of an emergency
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 0, "approach_speed_mps", "path_margin_m", "courtesy_gap_m", "reaction_time_s")
+        require_positive(self, "braking_mps2")
 
     def stopping_distance_m(self, speed_mps: float) -> float:
         """Distance in which a driver at this speed is ready to stop."""
@@ -195,6 +299,12 @@ class TraitSettings:
     epochs: int = 1000  # paper IV-B
     noise_m: float = 0.0  # standard deviation of the noise on every position in training, drawn anew in each epoch
 
+    def __post_init__(self) -> None:
+        sizes = ("embedding_sizes", "hidden_size", "encoder_output_size", "decoder_output_size")
+        require_at_least(self, 1, *sizes, "batch_size", "epochs")
+        require_at_least(self, 0, "kl_weight", "reconstruction_weight", "weight_decay", "noise_m")
+        require_positive(self, "learning_rate")
+
 
 @dataclass(frozen=True)
 class PolicySettings:
@@ -208,6 +318,11 @@ class PolicySettings:
     head_sizes: tuple[int, ...] = (256, 256)  # code
     attention: bool = True  # without, all vehicles count the same (the paper's ablation, IV-D)
     position_gain: float = 1.0  # positions are multiplied by this; observed in units of 20 m, they differ by little
+
+    def __post_init__(self) -> None:
+        sizes = ("embedding_sizes", "score_sizes", "context_size", "joint_sizes", "hidden_size", "head_sizes")
+        require_at_least(self, 1, *sizes)
+        require_positive(self, "position_gain")
 
 
 @dataclass(frozen=True)
@@ -233,4 +348,11 @@ class PpoSettings:
     total_steps: int = 10_000_000  # paper
     policy: PolicySettings = field(default_factory=PolicySettings)
     action_repeat: int = 1  # paper: a decision every step
-    time_limit_s: float = 50.0  # of training episodes; evaluation always has the paper's 50 s
+    time_limit_s: float = 50.0  # of training episodes, where the scene's is not shorter; evaluation has the scene's
+
+    def __post_init__(self) -> None:
+        counts = ("n_envs", "n_steps", "n_epochs", "n_minibatches", "total_steps", "action_repeat")
+        require_at_least(self, 1, *counts)
+        require_at_least(self, 0, "ent_coef", "final_ent_coef", "vf_coef")
+        require_positive(self, "learning_rate", "clip_range", "max_grad_norm", "time_limit_s")
+        require_fraction(self, "gamma", "gae_lambda")

@@ -10,6 +10,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from tint_sumo.errors import InputError
+from tint_sumo.provenance import CONFIG_FILE, PROVENANCE_FILE, made_by, present_origin
 
 RUN_FILE = "run.json"
 LOCK_FILE = ".lock"
@@ -64,10 +65,17 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 
 
 @contextmanager
-def claim_folder(folder: Path, settings: Mapping[str, Any]) -> Iterator[None]:
+def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bool = True) -> Iterator[None]:
     """In the block, ``folder`` is the home of the run described by ``settings``, a new one or that very run resumed.
 
-    One process at a time may work there; temporary files that killed processes left are removed.
+    One process at a time may work there; temporary files that killed processes left are removed. A new run that a
+    command begins is given provenance.json and config.yaml, which tell of the command; the runs that are parts of it
+    are not. They are no part of what the run is: another command line may resume it.
+
+    Args:
+        folder: of the run.
+        settings: what the run follows from.
+        with_versions: note the versions of packages, too; of a run that writes them elsewhere they are left out.
 
     Raises:
         InputError: the folder holds another run or files of unknown origin, or another process is working there.
@@ -85,8 +93,10 @@ def claim_folder(folder: Path, settings: Mapping[str, Any]) -> Iterator[None]:
         for partial in folder.rglob(".*.partial"):
             partial.unlink(missing_ok=True)
         if not (folder / RUN_FILE).exists():
+            _write_provenance(folder, with_versions)
             write_json(folder / RUN_FILE, wanted)
-        yield
+        with made_by(None):
+            yield
     finally:
         lock.release()
 
@@ -104,5 +114,19 @@ def _require_home(folder: Path, wanted: Mapping[str, Any]) -> None:
                 f"{folder} already holds another run (different: {', '.join(changed)}); "
                 "choose another --out or remove the folder"
             )
-    elif folder.exists() and any(entry.suffix != ".partial" and entry.name != LOCK_FILE for entry in folder.iterdir()):
+    elif folder.exists() and any(_is_strange(entry) for entry in folder.iterdir()):
         raise InputError(f"{folder} already holds other files; choose another --out or an empty folder")
+
+
+def _is_strange(entry: Path) -> bool:
+    """Whether a folder's entry is none that a run leaves that was killed at its very beginning."""
+    if entry.name == CONFIG_FILE:  # one of the user's own is not overwritten
+        return not entry.with_name(PROVENANCE_FILE).exists()
+    return entry.suffix != ".partial" and entry.name not in (LOCK_FILE, PROVENANCE_FILE)
+
+
+def _write_provenance(folder: Path, with_versions: bool) -> None:
+    origin = present_origin()
+    if origin is not None:
+        write_json(folder / PROVENANCE_FILE, origin.provenance(with_versions=with_versions))
+        write_text(folder / CONFIG_FILE, origin.config())

@@ -137,7 +137,7 @@ def test_a_trait_model_learns_from_it(merge_data: Path, tmp_path: Path) -> None:
     assert labels.dtype == np.int64
     assert set(labels.tolist()) == {0, 1}
     for method in ("vae", "classifier"):
-        train_traits(merge_data, tmp_path / method, method=method, settings=TINY, progress=False)
+        train_traits(merge_data, tmp_path / method, method=method, settings=TINY)
         assert 0.0 < evaluate_traits(merge_data, tmp_path / method)["accuracy"] <= 1.0
     with pytest.raises(InputError, match="these are of vTypes"):
         plot_traits(merge_data, tmp_path / "vae", tmp_path / "pictures")
@@ -146,7 +146,7 @@ def test_a_trait_model_learns_from_it(merge_data: Path, tmp_path: Path) -> None:
 def test_the_classifier_needs_two_vtypes(own_network: Make, tmp_path: Path) -> None:
     record_sumocfg(own_network("braunschweig").sumocfg, tmp_path / "d", 100, progress=False)
     with pytest.raises(InputError, match="two kinds of drivers apart, and these windows have 3; choose"):
-        train_traits(tmp_path / "d", tmp_path / "c", method="classifier", settings=TINY, progress=False)
+        train_traits(tmp_path / "d", tmp_path / "c", method="classifier", settings=TINY)
     assert not (tmp_path / "c").exists()
 
 

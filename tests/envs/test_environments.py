@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.passive_env_checker import env_render_passive_checker
 from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.vec_env import VecMonitor
@@ -105,7 +106,8 @@ def test_gymnasiums_checker(env: SceneEnv) -> None:
 
 def test_gymnasiums_checker_with_rendering() -> None:
     env = gymnasium.make(ENV_ID, render_mode="rgb_array", tracks=True)
-    check_env(env.unwrapped)
+    check_env(env.unwrapped, skip_render_check=True)  # else it tries all render modes: see test_window
+    env_render_passive_checker(env.unwrapped)
     env.close()
 
 
@@ -358,7 +360,7 @@ def test_rendering_shows_every_vehicle() -> None:
         ({"time_limit_s": float("inf")}, "time_limit_s must be at least a step of 0.1 s, and finite"),
         ({"position_noise_m": -0.1}, "must be finite and not negative"),
         ({"position_noise_m": float("nan")}, "must be finite and not negative"),
-        ({"render_mode": "human"}, "unknown render_mode 'human'"),
+        ({"render_mode": "ansi"}, "unknown render_mode 'ansi'; choose one of None, 'human', 'rgb_array'"),
     ],
 )
 def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from shapely.affinity import rotate, translate
 from shapely.geometry import Polygon, box
@@ -44,7 +44,6 @@ def pose(x_m: float, y_m: float, heading_rad: float) -> tuple[float, float, floa
     return x_m, y_m, math.cos(heading_rad), math.sin(heading_rad)
 
 
-@settings(deadline=None)  # the first compiled function of a process takes its time
 @given(st.floats(-6, 6), st.floats(-6, 6), st.floats(0, math.pi))
 def test_box_distance_is_that_of_the_polygons(x_m: float, y_m: float, heading_rad: float) -> None:
     sizes_m = (SHAPE.length_m, SHAPE.width_m, BICYCLE.length_m, BICYCLE.width_m)

@@ -444,3 +444,20 @@ def test_a_range_of_one_number_is_that_number(batch: Simulation) -> None:
 def test_probabilities_outside_the_unit_interval_are_refused(p: float) -> None:
     with pytest.raises(InputError, match=r"must be a probability in \[0, 1\]"):
         Traffic(p_conservative=p)
+
+
+def test_a_scene_of_few_slots_begins_with_those_who_have_come_furthest() -> None:
+    few, all_of_them = (_fronts_at_the_beginning(slots) for slots in (4, 12))
+    assert few == [fronts_m[-4:] for fronts_m in all_of_them]
+
+
+def _fronts_at_the_beginning(slots: int) -> list[list[float]]:
+    """Of some episodes, in the order of the distances."""
+    simulation = Simulation(1, replace(T, max_vehicles=slots), with_ego=False)
+    fronts_m = []
+    for seed in range(5):
+        simulation.reset(0, seed)
+        fronts_m.append(sorted(simulation.slots.front_m[0][simulation.slots.present[0]].tolist()))
+        simulation.step()
+    simulation.close()
+    return fronts_m

@@ -1,4 +1,4 @@
-"""Jobs for tests of the pool; run as a program, a pool that must be interrupted."""
+"""Jobs for tests of the pool; run as a program, a pool that must be interrupted unless its jobs are short."""
 
 import os
 import sys
@@ -8,7 +8,8 @@ from pathlib import Path
 
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_text
-from tint_sumo.progress import Report
+from tint_sumo.progress import Progress, Report
+from tint_sumo.standings import Title
 from tint_sumo.study.pool import run_jobs
 
 
@@ -19,18 +20,25 @@ class FileJob:
     name: str
     folder: Path
     needs: tuple[str, ...] = ()
+    reports: int = 1
     patience_s: float = 0.0
     failure: str = ""
 
     def path(self, state: str) -> Path:
         return self.folder / f"{self.name}.{state}"
 
+    @property
+    def title(self) -> Title:
+        return Title(self.name)
+
     def is_done(self) -> bool:
         return self.path("done").exists()
 
     def run(self, report: Report) -> str:
         write_text(self.path("pid"), str(os.getpid()))
-        report(0, 1, "waiting")
+        for done in range(self.reports):
+            report(Progress(done, self.reports, "line", {"success": 0.5}))
+            time.sleep(0.3 * (self.reports > 1))
         if self.failure == "refused":
             raise InputError("this is not for me")
         if self.failure == "died":
@@ -46,8 +54,9 @@ class FileJob:
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1])
+    folder, is_short = Path(sys.argv[1]), "short" in sys.argv
+    times = {"reports": 3} if is_short else {"patience_s": 60.0}
     try:
-        run_jobs([FileJob("first", folder, patience_s=60.0), FileJob("second", folder, patience_s=60.0)], workers=2)
+        run_jobs([FileJob(name, folder, **times) for name in ("first", "second")], workers=2)
     except KeyboardInterrupt:
         sys.exit(130)

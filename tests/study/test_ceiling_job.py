@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from tint_sumo.errors import InputError
+from tint_sumo.progress import Progress
 from tint_sumo.study import budgets
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.ceiling import ceiling
@@ -15,10 +16,10 @@ def test_there_is_a_ceiling_for_each_mix_of_the_training_s_world(tmp_path: Path)
     tests = (budgets.Trials((Conditions(0.1), *elsewhere), 10), budgets.Trials((Conditions(0.0),), 5))
     job = CeilingJob(tests, tmp_path)
     assert not job.is_done()
-    told: list[tuple[int, int, str]] = []
-    line = job.run(lambda *content: told.append(content))
+    told: list[Progress] = []
+    line = job.run(told.append)
     assert job.is_done()
-    assert told == [(0, 2, "P 0.1"), (1, 2, "P 0")]
+    assert told == [Progress(0, 15, "case"), Progress(10, 15, "case")]
     expected = ceiling(0.1, 10, CASES)
     assert read_ceilings(tmp_path) == {0.1: expected, 0.0: 0.0}
     assert line == f"P 0.1: {expected:.1%}, P 0: 0.0%"

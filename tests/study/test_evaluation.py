@@ -8,6 +8,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from tint_sumo.config import STEP_S
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.errors import InputError
+from tint_sumo.progress import Progress
 from tint_sumo.study.evaluation import CASE_SEED, Case, Evaluation, case_seed, evaluate
 from tint_sumo.study.rules import AlwaysGo, TimeToCollision
 
@@ -80,16 +81,17 @@ def test_the_state_is_carried_and_episode_starts_are_told() -> None:
 
 def test_the_environment_is_closed_and_progress_told() -> None:
     made: list[VecEnv] = []
-    told: list[tuple[int, int]] = []
+    told: list[Progress] = []
 
     def make(num_envs: int) -> VecEnv:
         made.append(make_venv(num_envs))
         return made[-1]
 
-    evaluate(AlwaysGo(), make, 5, 0, batch=4, report=lambda done, total, _: told.append((done, total)))
+    evaluate(AlwaysGo(), make, 5, 0, batch=4, report=told.append)
     evaluate(AlwaysGo(), partial(make_venv, backend="libsumo"), 1, 0)  # refused if libsumo were still busy
     assert [venv.num_envs for venv in made] == [4]
-    assert told == [(done, 5) for done in range(1, 6)]
+    assert [(one.done, one.total, one.unit) for one in told] == [(done, 5, "case") for done in range(1, 6)]
+    assert all(set(one.measures) == {"success", "collision"} for one in told)
 
 
 def test_summary() -> None:

@@ -12,6 +12,7 @@ from PIL import Image
 from tint_sumo import ENV_IDS
 from tint_sumo.config import STEP_S
 from tint_sumo.errors import InputError
+from tint_sumo.progress import Progress
 from tint_sumo.scenes import find_scene
 from tint_sumo.scenes.layout import layout
 from tint_sumo.study.drawing import SIZE_PX, Artist
@@ -134,16 +135,16 @@ def test_every_scene_can_be_filmed(scene: str, tmp_path: Path) -> None:
 
 
 def test_a_gif_runs_as_fast_as_the_world(tmp_path: Path) -> None:
-    reports: list[tuple[int, int]] = []
+    reports: list[Progress] = []
     film = render_case(
         load_policy("always_go"),
         CASE,
         tmp_path / "film.gif",
         p_conservative=P,
-        report=lambda done, total, note: reports.append((done, total)),
+        report=reports.append,
     )
     assert film == Film("collision", 2.4, 25)
-    assert reports == [(done, 25) for done in range(1, 26)]
+    assert reports == [Progress(done, 25, "frame") for done in range(1, 26)]
     with Image.open(tmp_path / "film.gif") as gif:
         assert (gif.n_frames, gif.size, gif.info["duration"]) == (25, SIZE_PX, 100)  # type: ignore[attr-defined]
 

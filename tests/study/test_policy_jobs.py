@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from tint_sumo.config import PpoSettings, Share
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_text
-from tint_sumo.progress import silent
+from tint_sumo.progress import Progress, silent
 from tint_sumo.study import budgets, policy_jobs
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.evaluation import evaluate
@@ -87,10 +88,10 @@ def test_a_training_takes_the_study_s_trait_model(tmp_path: Path, brief: PpoSett
     for suffix in (".json", ".safetensors"):
         content = (encoders / f"vae{suffix}").read_bytes()
         (tmp_path / "traits" / "vae" / f"model{suffix}").write_bytes(content)
-    told: list[tuple[int, int]] = []
+    told: list[Progress] = []
     job = TrainJob("vae", 0.4, 0, brief, False, tmp_path)
-    assert job.run(lambda done, total, _: told.append((done, total))).startswith("trained (")
-    assert told == [(0, 128), (64, 128), (128, 128)]
+    assert job.run(told.append) == "", "the last report says what came out"
+    assert [(one.done, one.total) for one in told] == [(0, 128), (64, 128), (128, 128)]
     assert (job.folder / "traits.safetensors").read_bytes() == (encoders / "vae.safetensors").read_bytes()
 
 
@@ -107,10 +108,10 @@ def test_a_rule_is_tested_on_the_same_cases_as_everyone_but_not_after_parts_of_a
     other, part = Conditions(ALL_MIXES, tau_s=1.5), Conditions(0.4, percent=25)
     job = make_job("always_go", None, tmp_path, ((Conditions(0.4), part), 4), ((other,), 3))
     assert not job.is_done()
-    told: list[tuple[int, int]] = []
-    assert job.run(lambda done, total, _: told.append((done, total))).startswith("success ")
+    told: list[Progress] = []
+    assert job.run(told.append).startswith("success ")
     assert job.is_done()
-    assert told == [(done, 7) for done in range(1, 8)]
+    assert [(one.done, one.total) for one in told] == [(done, 7) for done in range(1, 8)]
     result = Result.read(job.result_file)
     assert (result.method, result.origin, result.mix) == ("always_go", GIVEN, None)
     assert [(one.conditions, len(one.evaluation.cases)) for one in result.tested] == [(Conditions(0.4), 4), (other, 3)]
@@ -147,9 +148,9 @@ def test_mixes_that_a_policy_is_tested_at_lie_within_those_of_its_training(
 def test_parts_of_a_training_are_other_policies(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded: list[Path] = []
 
-    def load(file: Path) -> object:
+    def load(file: Path, **scene: Any) -> object:
         loaded.append(file)
-        return load_policy(file)
+        return load_policy(file, **scene)
 
     monkeypatch.setattr(policy_jobs, "load_policy", load)
     parts = tuple(Conditions(0.4, percent=percent) for percent in (100, 25, 50))

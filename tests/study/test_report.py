@@ -9,7 +9,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.files import write_json, write_text
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE
-from tint_sumo.study.report import StudyReport, to_csv, to_markdown, write_report
+from tint_sumo.study.report import StudyReport, result_tables, to_csv, to_markdown, write_report
 from tint_sumo.study.results import Result
 from tint_sumo.study.rows import Row, tabulate
 from tint_sumo.study.statistics import Rate, difference_interval, rate_interval
@@ -189,7 +189,7 @@ def test_differences_are_to_the_oracle_and_to_no_labels_with_intervals(report: S
 def test_methods_that_did_not_meet_the_same_cases_are_not_compared() -> None:
     fewer = [trained("vae", seed, {Conditions(0.4): (4, 0, 1)}) for seed in range(2)]
     rows = tabulate([*SEVERAL_SEEDS[:3], *fewer])
-    (line,) = tables(to_markdown(rows, {}))["Differences in success"][1:]
+    (line,) = tables(to_markdown(result_tables(rows, {})))["Differences in success"][1:]
     assert line == ["paper's method", "oracle", "-", "-"]
 
 

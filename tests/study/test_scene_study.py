@@ -50,7 +50,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_a_model_of_another_scene_is_refused_unless_it_is_asked_for(
     recordings: dict[str, Path], tmp_path: Path
 ) -> None:
-    train_traits(recordings["roundabout"], tmp_path / "model", method="vae", settings=SMALL, progress=False)
+    train_traits(recordings["roundabout"], tmp_path / "model", method="vae", settings=SMALL)
     model = tmp_path / "model"
     assert evaluate_traits(recordings["roundabout"], model)["windows"] > 0
     with pytest.raises(

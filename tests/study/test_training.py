@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,6 +23,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.policy import ClassifierTraits, EncoderTraits, OracleTraits, RecurrentPPO, StreamingTraits
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.storage import load_policy_network, read_policy_card
+from tint_sumo.progress import Progress, Report
 from tint_sumo.study.evaluation import CASE_SEED, evaluate
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.training import CHECKPOINT_FILE, CURVE_FILE, ZIP_FILE, share_training, train_policy
@@ -42,9 +42,9 @@ def trait_model(encoders: Path, tmp_path: Path) -> Path:
     return tmp_path / "some" / "encoder.safetensors"
 
 
-def interrupt_at(steps: int) -> Callable[[int, int, str], None]:
-    def report(done: int, total: int, note: str) -> None:
-        if done >= steps:
+def interrupt_at(steps: int) -> Report:
+    def report(progress: Progress) -> None:
+        if progress.done >= steps:
             raise KeyboardInterrupt
 
     return report
@@ -77,12 +77,11 @@ def observed(source_of: Path, num_envs: int = 16) -> Any:
 
 def test_a_run_leaves_a_policy_its_card_its_snapshots_and_its_curve(tmp_path: Path, brief: PpoSettings) -> None:
     out = tmp_path / "run"
-    told: list[tuple[int, int]] = []
-    policy = train_policy(
-        "no_labels", (0.25, 0.5), 250, 3, out, settings=brief, report=lambda done, total, _: told.append((done, total))
-    )
+    told: list[Progress] = []
+    policy = train_policy("no_labels", (0.25, 0.5), 250, 3, out, settings=brief, report=told.append)
     assert policy == out / "policy.safetensors"
-    assert told == [(0, 250), (64, 250), (128, 250), (192, 250), (250, 250)]  # whole rollouts of 64
+    assert [one.done for one in told] == [0, 64, 128, 192, 250], "rollouts have 64 steps"
+    assert all((one.total, one.unit) == (250, "step") for one in told)
     card = json.loads((out / "policy.json").read_text())
     assert (card["method"], card["p_conservative"], card["steps"], card["seed"]) == ("no_labels", [0.25, 0.5], 250, 3)
     assert card["settings"]["n_steps"] == 16
@@ -94,14 +93,14 @@ def test_a_run_leaves_a_policy_its_card_its_snapshots_and_its_curve(tmp_path: Pa
 
 
 def test_the_log_and_the_curve_tell_the_outcomes_of_recent_episodes(tmp_path: Path, brief: PpoSettings) -> None:
-    notes: list[str] = []
-    train_policy("oracle", 0.4, 256, 0, tmp_path, settings=brief, report=lambda *told: notes.append(told[2]))
+    told: list[Progress] = []
+    train_policy("oracle", 0.4, 256, 0, tmp_path, settings=brief, report=told.append)
     curve = pd.read_csv(tmp_path / CURVE_FILE)
     assert list(curve) == ["decisions", "success", "timeout", "collision"]
     assert curve["decisions"].tolist() == [64, 128, 192, 256]
     assert (curve[["success", "timeout", "collision"]].sum(axis=1) == 1.0).all()
     assert (curve["timeout"] == 1.0).all(), "episodes of 0.8 s end by their time limit"
-    assert notes == ["", *["success 0%, collision 0%"] * 4]
+    assert [one.measures for one in told] == [{}, *[{"success": 0.0, "collision": 0.0}] * 4]
     assert list((tmp_path / "tensorboard").iterdir())
 
 
@@ -182,9 +181,9 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, brief: PpoSetti
         load_policy(out)
     assert load_policy(out / "policy-25").p_conservative == (0.4, 0.4)
     kept = (out / "policy-25.safetensors").stat().st_mtime_ns
-    told: list[int] = []
-    train_policy("oracle", 0.4, 512, 0, out, settings=brief, report=lambda done, *_: told.append(done))
-    assert told == [192, 256, 320, 384, 448, 512]  # the rollout that nothing was learnt from is collected again
+    told: list[Progress] = []
+    train_policy("oracle", 0.4, 512, 0, out, settings=brief, report=told.append)
+    assert [one.done for one in told] == [192, 256, 320, 384, 448, 512], "what nothing was learnt from is repeated"
     assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
     assert (out / "policy-25.safetensors").stat().st_mtime_ns == kept
     assert pd.read_csv(out / CURVE_FILE)["decisions"].tolist() == [64 * rollout for rollout in range(1, 9)]
@@ -240,17 +239,9 @@ def test_a_killed_run_leaves_whole_files_and_goes_on(tmp_path: Path) -> None:
     done = RecurrentPPO.load(out / CHECKPOINT_FILE).num_timesteps
     assert runs.STEPS / 4 <= done < runs.STEPS
     assert pd.read_csv(out / CURVE_FILE)["decisions"].is_monotonic_increasing
-    told: list[int] = []
-    train_policy(
-        runs.METHOD,
-        0.4,
-        runs.STEPS,
-        runs.SEED,
-        out,
-        settings=runs.SETTINGS,
-        report=lambda steps, *_: told.append(steps),
-    )
-    assert told[0] == done
+    told: list[Progress] = []
+    train_policy(runs.METHOD, 0.4, runs.STEPS, runs.SEED, out, settings=runs.SETTINGS, report=told.append)
+    assert told[0].done == done
     assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
     assert not list(out.rglob("*.partial"))
     assert pd.read_csv(out / CURVE_FILE)["decisions"].tolist() == list(range(64, runs.STEPS + 1, 64))

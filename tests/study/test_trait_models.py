@@ -31,7 +31,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def model(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("model") / "run"
-    train_traits(dataset, folder, settings=SMALL, seed=SEED, progress=False)
+    train_traits(dataset, folder, settings=SMALL, seed=SEED)
     return folder
 
 
@@ -46,7 +46,7 @@ def test_training_sees_the_training_episodes_only(
         return original(windows, *args, **kwargs)
 
     monkeypatch.setattr(trait_models, "train", train)
-    card = train_traits(dataset, tmp_path / "run", settings=SMALL, seed=SEED, progress=False)
+    card = train_traits(dataset, tmp_path / "run", settings=SMALL, seed=SEED)
     windows = load_windows(dataset)
     _, test = split_by_episode(windows, TEST_FRACTION, SEED)
     assert set(seen[0].episode).isdisjoint(windows.episode[test])
@@ -112,7 +112,7 @@ def test_noise_makes_evaluation_harder_and_is_repeatable(dataset: Path) -> None:
 
 @pytest.mark.parametrize("method", sorted(TRAIT_METHODS))
 def test_every_method_trains_on_a_dataset_and_reports_its_errors(dataset: Path, tmp_path: Path, method: str) -> None:
-    train_traits(dataset, tmp_path, method=method, settings=SMALL, seed=SEED, progress=False)
+    train_traits(dataset, tmp_path, method=method, settings=SMALL, seed=SEED)
     found = evaluate_traits(dataset, tmp_path)
     assert 0.4 < found["accuracy"] <= 1.0
     assert (found["error_m"] is None) == (method == "classifier")

@@ -70,7 +70,7 @@ def test_what_noise_leaves_open_shows_as_uncertainty(small, tmp_path):
     """A noisy window of three steps hardly tells 2.4 from 3 m/s, one of twenty does, and three of them even more."""
     windows, _ = two_populations(600, windows_each=4, shortest=3)
     settings = replace(small, hidden_size=16, learning_rate=1e-2, epochs=12, noise_m=0.1)
-    model = train(windows, settings, tmp_path, method="cross_window", progress=False)
+    model = train(windows, settings, tmp_path, method="cross_window")
     std = encode_windows(model, windows, noise_m=0.1).std.prod(axis=1)
     short, full = std[windows.length <= 4], std[windows.length == 20]
     assert np.median(short) > 1.2 * np.median(full)

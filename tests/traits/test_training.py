@@ -38,7 +38,7 @@ def interrupt_at_step(monkeypatch, step):
 
 
 def test_a_run_writes_a_model_that_loads_as_trained(windows, small, tmp_path):
-    model = train(windows, small, tmp_path / "run", progress=False, card={"data": "street"})
+    model = train(windows, small, tmp_path / "run", card={"data": "street"})
     assert_same_weights(load(tmp_path / "run"), model)
     assert not model.training
     card = json.loads((tmp_path / "run" / "model.json").read_text())
@@ -50,17 +50,17 @@ def test_a_run_writes_a_model_that_loads_as_trained(windows, small, tmp_path):
 
 
 def test_an_interrupted_run_resumes_to_the_very_same_weights(windows, small, tmp_path, monkeypatch):
-    whole = train(windows, small, tmp_path / "whole", progress=False)
+    whole = train(windows, small, tmp_path / "whole")
     steps_per_epoch = -(-len(windows.length) // small.batch_size)
     monkeypatch.setattr(training, "CHECKPOINT_INTERVAL_S", 0.0)
     with monkeypatch.context() as interrupted, pytest.raises(KeyboardInterrupt):
         interrupt_at_step(interrupted, steps_per_epoch + 3)
-        train(windows, small, tmp_path / "broken", progress=False)
+        train(windows, small, tmp_path / "broken")
     assert {path.name for path in (tmp_path / "broken").glob("[!.]*")} == {"run.json", CHECKPOINT_FILE}
 
     with monkeypatch.context() as counted:
         interrupt_at_step(counted, 2 * steps_per_epoch)  # the two epochs of three that are left
-        resumed = train(windows, small, tmp_path / "broken", progress=False)
+        resumed = train(windows, small, tmp_path / "broken")
     assert_same_weights(resumed, whole)
     cards = [json.loads((tmp_path / run / "model.json").read_text()) for run in ("whole", "broken")]
     assert cards[0] == cards[1]
@@ -68,30 +68,30 @@ def test_an_interrupted_run_resumes_to_the_very_same_weights(windows, small, tmp
 
 
 def test_a_finished_run_is_loaded_and_not_repeated(windows, small, tmp_path, monkeypatch):
-    model = train(windows, small, tmp_path, progress=False)
+    model = train(windows, small, tmp_path)
     interrupt_at_step(monkeypatch, 0)
-    assert_same_weights(train(windows, small, tmp_path, progress=False), model)
+    assert_same_weights(train(windows, small, tmp_path), model)
 
 
 def test_the_seed_decides_the_result_and_the_global_generator_is_left_alone(windows, small, tmp_path):
     torch.manual_seed(5)
     expected = torch.rand(1)
     torch.manual_seed(5)
-    first = train(windows, small, tmp_path / "a", seed=7, progress=False)
+    first = train(windows, small, tmp_path / "a", seed=7)
     assert torch.equal(torch.rand(1), expected)
-    assert_same_weights(train(windows, small, tmp_path / "b", seed=7, progress=False), first)
-    other = train(windows, small, tmp_path / "c", seed=8, progress=False)
+    assert_same_weights(train(windows, small, tmp_path / "b", seed=7), first)
+    other = train(windows, small, tmp_path / "c", seed=8)
     assert not torch.equal(other.encoder.mean_head.weight, first.encoder.mean_head.weight)
 
 
 @pytest.mark.parametrize("change", ["seed", "settings", "windows"])
 def test_a_folder_of_another_run_is_refused_and_kept(windows, small, tmp_path, change):
-    train(windows, small, tmp_path, progress=False)
+    train(windows, small, tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     settings = replace(small, epochs=9) if change == "settings" else small
     shifted = replace(windows, states=windows.states + np.float32(0.5)) if change == "windows" else windows
     with pytest.raises(InputError, match=f"already holds another run.*{change}"):
-        train(shifted, settings, tmp_path, seed=int(change == "seed"), progress=False)
+        train(shifted, settings, tmp_path, seed=int(change == "seed"))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -99,32 +99,37 @@ def test_a_damaged_checkpoint_is_reported(windows, small, tmp_path, monkeypatch)
     monkeypatch.setattr(training, "CHECKPOINT_INTERVAL_S", 0.0)
     with monkeypatch.context() as interrupted, pytest.raises(KeyboardInterrupt):
         interrupt_at_step(interrupted, 10)
-        train(windows, small, tmp_path, progress=False)
+        train(windows, small, tmp_path)
     checkpoint = tmp_path / CHECKPOINT_FILE
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     with pytest.raises(InputError, match=r"checkpoint\.pt is damaged; remove it"):
-        train(windows, small, tmp_path, progress=False)
+        train(windows, small, tmp_path)
 
 
 def test_bad_requests_leave_no_folder(windows, small, tmp_path):
     with pytest.raises(InputError, match="unknown trait method"):
-        train(windows, small, tmp_path / "run", method="theirs", progress=False)
+        train(windows, small, tmp_path / "run", method="theirs")
     nothing = replace(windows, **{name: value[:0] for name, value in vars(windows).items()})
     with pytest.raises(InputError, match="no windows to train on"):
-        train(nothing, small, tmp_path / "run", progress=False)
+        train(nothing, small, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_progress_goes_to_stderr(windows, small, tmp_path, capsys):
-    train(windows, small, tmp_path, progress=True)
-    shown = capsys.readouterr()
-    assert "traits vae" in shown.err
-    assert shown.out == ""
+def test_progress_is_told_in_windows_with_the_loss(windows, small, tmp_path):
+    told = []
+    train(windows, small, tmp_path, report=told.append)
+    count = len(windows.length)
+    assert {(one.total, one.unit) for one in told} == {(small.epochs * count, "window")}
+    assert [one.done for one in told] == sorted({one.done for one in told})
+    assert (told[0].done, told[0].measures) == (0, {})
+    assert told[-1].done == small.epochs * count
+    card = json.loads((tmp_path / "model.json").read_text())
+    assert told[-1].measures == {"loss": pytest.approx(card["loss"]["total"])}
 
 
 def test_large_networks_train_in_bfloat16(windows, small, tmp_path):
     settings = replace(small, hidden_size=training.BFLOAT16_HIDDEN_SIZE, epochs=1)
-    model = train(windows, settings, tmp_path, progress=False)
+    model = train(windows, settings, tmp_path)
     assert all(value.dtype == torch.float32 and value.isfinite().all() for value in model.state_dict().values())
 
 
@@ -133,7 +138,7 @@ def test_two_populations_separate(small, tmp_path, method):
     windows, slow = two_populations(1000)
     labels = slow if TRAIT_METHODS[method].uses_labels else None
     settings = replace(small, hidden_size=16, learning_rate=1e-2, epochs=8)
-    model = train(windows, settings, tmp_path, method=method, conservative=labels, progress=False)
+    model = train(windows, settings, tmp_path, method=method, conservative=labels)
     assert evaluate(model, windows, slow).accuracy > 0.95
 
 
@@ -142,7 +147,7 @@ def test_only_the_classifier_gets_labels(windows, small, tmp_path):
     for method in TRAIT_METHODS:
         labels = None if TRAIT_METHODS[method].uses_labels else np.ones(len(windows), bool)
         with pytest.raises(ValueError, match="labels are for the methods that learn with them"):
-            train(windows, small, tmp_path / method, method=method, conservative=labels, progress=False)
+            train(windows, small, tmp_path / method, method=method, conservative=labels)
 
 
 def test_noise_is_drawn_anew_in_every_epoch_from_the_seed(windows, small, tmp_path, monkeypatch):
@@ -155,9 +160,9 @@ def test_noise_is_drawn_anew_in_every_epoch_from_the_seed(windows, small, tmp_pa
 
     monkeypatch.setattr(Vae, "loss", loss)
     one_batch = replace(small, batch_size=len(windows), epochs=2, noise_m=0.1)
-    first = train(windows, one_batch, tmp_path / "first", progress=False)
+    first = train(windows, one_batch, tmp_path / "first")
     assert seen[0] != pytest.approx(seen[1], abs=1e-3)
-    again = train(windows, one_batch, tmp_path / "again", progress=False)
+    again = train(windows, one_batch, tmp_path / "again")
     assert_same_weights(first, again)
-    clean = train(windows, replace(one_batch, noise_m=0.0), tmp_path / "clean", progress=False)
+    clean = train(windows, replace(one_batch, noise_m=0.0), tmp_path / "clean")
     assert clean.feature_scale[0] < first.feature_scale[0]

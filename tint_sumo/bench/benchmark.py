@@ -33,10 +33,11 @@ from tint_sumo.scenes import T_INTERSECTION, find_scene
 from tint_sumo.simulation.link import SUMO_COLLISION_CHECK
 from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.study.budgets import BUDGETS, TRAIT_BUDGETS
+from tint_sumo.timing import StepPart
 from tint_sumo.traits import TRAIT_METHODS
 from tint_sumo.traits.training import train
 
-BREAKDOWN_METHOD = "clocks around the named functions in a pass of its own, their own cost subtracted"
+BREAKDOWN_METHOD = "clocks around the functions that do these parts, in a pass of its own, their own cost subtracted"
 
 _MIB = 2**20
 _WARM_UP_STEPS = 100  # of all replicas: their episodes begin together and drift apart
@@ -277,24 +278,13 @@ def _checking_steps_per_s(sizes: Sizes, seed: int) -> float:
 
 
 def _breakdown(sizes: Sizes) -> dict[str, Any]:
+    clocks = Clocks()
     with _driven(sizes) as driven:
-        episodes, simulation = driven.batch.episodes, driven.simulation
-        clocks = Clocks()
-        link = simulation.link
-        link.connection = replace(link.connection, step=clocks.around(link.connection.step, "sumo"))
-        clocks.watch(link, "lane_positions_m", "getters")
-        clocks.watch(simulation, "_admit", "spawning")
-        clocks.watch(simulation, "reset", "spawning")
-        clocks.watch(simulation.egos, "update_claims", "claims")
-        clocks.watch(simulation.yielding, "answer", "claims")
-        clocks.watch(simulation.egos, "look_around", "safety_check")
-        clocks.watch(episodes, "_observe", "observation")
-        clocks.watch(episodes, "step", "other")  # driving the egos, rewards, the end of episodes
-        clocks.watch(driven.batch, "step", "other")
-        clocks.watch(driven.env, "step", "adapter")
+        batch, simulation = driven.batch, driven.simulation
+        clocks.watch(driven.env, batch, batch.episodes)
+        clocks.watch(simulation, simulation.egos, simulation.yielding, simulation.link)
         steps = sum(driven.turn() for _ in range(sizes.turns))
-    parts = ("sumo", "getters", "spawning", "claims", "safety_check", "observation", "adapter", "other")
-    return {"breakdown_us": {part: clocks.spent_s[part] / steps * 1e6 for part in parts}}
+    return {"breakdown_us": {part.value: clocks.spent_s[part] / steps * 1e6 for part in StepPart}}
 
 
 def _gym_speed(sizes: Sizes) -> dict[str, Any]:
@@ -387,7 +377,6 @@ def _train_windows_per_s(method: str, windows: int) -> float:
             Path(folder),
             method=method,
             conservative=labels,
-            progress=False,
         )
         return windows / (time.perf_counter() - start)
 

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from tint_sumo.processes import answer, start_worker, told
+from tint_sumo.timing import marked_methods
 
 Turn = Callable[[], float]  # measures once more and returns what it found
 
@@ -23,9 +24,11 @@ class Clocks:
         idle = self.around(lambda: None, "idle")
         self._cost_s = min(_call_s(idle) for _ in range(10))  # whatever interrupts a clock is no cost of its own
 
-    def watch(self, owner: object, name: str, part: str) -> None:
-        """Put a clock around a method for good."""
-        setattr(owner, name, self.around(getattr(owner, name), part))
+    def watch(self, *owners: object) -> None:
+        """Put clocks around the methods of these objects that are marked as parts of a step, for good."""
+        for owner in owners:
+            for name, part in marked_methods(owner):
+                setattr(owner, name, self.around(getattr(owner, name), part))
 
     def around(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
         self.spent_s.setdefault(part, 0.0)

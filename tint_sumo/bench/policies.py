@@ -89,7 +89,7 @@ def decision_ms(settings: PpoSettings, decisions: int) -> float:
     with closing(ActionRepeat(observed, settings.action_repeat)) as venv, one_thread():
         policy = GruPolicy(venv.observation_space, venv.action_space, lambda _: 0.0, settings=settings.policy)
         clocks = Clocks()
-        clocks.watch(env, "step_wait", "environment")
+        clocks.watch(env)
         decide = clocks.around(_driving(policy, venv), "decision")
         spent_s = [0.0]
         for _ in range(decisions):

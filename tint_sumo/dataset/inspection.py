@@ -18,9 +18,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from tint_sumo.config import POPULATIONS
 from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, read_shards
-from tint_sumo.dataset.windows import own_vtypes, read_manifest
+from tint_sumo.dataset.windows import drivers_of, own_vtypes, read_manifest
 from tint_sumo.errors import InputError
 from tint_sumo.files import whole_file
 from tint_sumo.progress import make_bar
@@ -148,7 +147,7 @@ def _colours(manifest: Mapping[str, Any]) -> dict[str, Colour]:
     """Of each trait."""
     vtypes = own_vtypes(manifest)
     if vtypes is None:
-        return {profile.name: profile.rgb for profile in POPULATIONS[manifest["population"]].profiles}
+        return {profile.name: profile.rgb for profile in drivers_of(manifest).profiles}
     palette = colormaps["tab10"]
     return {vtype: palette(number % palette.N)[:3] for number, vtype in enumerate(vtypes)}
 

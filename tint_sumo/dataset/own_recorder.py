@@ -5,7 +5,6 @@ windows consist of such steps. The labels are the vTypes. Positions are what the
 leaders that SUMO's drivers see; ``route`` is empty.
 """
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -48,7 +47,7 @@ class OwnRecording:
             "kind": "dataset",
             "schema_version": SCHEMA_VERSION,
             "scene": self.config.name,
-            "scene_digest": _digest(self.config),
+            "scene_digest": self.config.digest,
             "windows": self.windows,
             "p_conservative": None,
             "population": list(self.vtypes),
@@ -79,15 +78,6 @@ def record_sumocfg(
         workers=workers,
         progress=progress,
     )
-
-
-def _digest(config: SumoConfig) -> str:
-    """What tells the configuration's input from others'."""
-    whole = hashlib.sha256()
-    for file in config.files:
-        with file.open("rb") as content:
-            whole.update(hashlib.file_digest(content, "sha256").digest())
-    return whole.hexdigest()[:16]
 
 
 def _record_shard(recording: OwnRecording, out: Path, shard: int) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import POPULATIONS, Share, Traffic
+from tint_sumo.config import Population, Share, find_population, population_name
 from tint_sumo.dataset.fcd import write_fcd
 from tint_sumo.dataset.schema import FCD, SCHEMA_VERSION, TABLES, TRAJECTORIES, read_shard, shard_file
 from tint_sumo.dataset.shards import (
@@ -21,11 +21,11 @@ from tint_sumo.dataset.shards import (
     require_sizes,
     write_tables,
 )
-from tint_sumo.errors import InputError
-from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene
+from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
 from tint_sumo.scenes.geometry import Floats, Numbers
 from tint_sumo.scenes.layout import layout
 from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.structures import plain
 
 EPISODES_PER_SHARD = 16
 
@@ -36,29 +36,28 @@ class Recording:
 
     windows: int
     p_conservative: Share = 0.5
-    population: str = "traits"  # a name in POPULATIONS
+    population: Population | None = None  # the scene's if not given
     seed: int = 0
-    scene: str = T_INTERSECTION  # a name in SCENES
+    scene: str | Scene = T_INTERSECTION
 
     def __post_init__(self) -> None:
         require_sizes(self.windows, self.seed)
-        if self.population not in POPULATIONS:
-            raise InputError(f"unknown population {self.population!r}; choose one of: {', '.join(POPULATIONS)}")
         self.played()
 
     def played(self) -> Scene:
-        traffic, population = Traffic(p_conservative=self.p_conservative), POPULATIONS[self.population]
-        return replace(find_scene(self.scene), traffic=traffic, population=population)
+        scene = find_scene(self.scene)
+        traffic = replace(scene.traffic, p_conservative=self.p_conservative)
+        return replace(scene, traffic=traffic, population=self.population or scene.population)
 
     def settings(self) -> dict[str, Any]:
+        played = self.played()
         return {
             "kind": "dataset",
             "schema_version": SCHEMA_VERSION,
-            "scene": self.scene,
-            "scene_digest": self.played().digest,
+            **described(played),
             "windows": self.windows,
             "p_conservative": self.p_conservative,
-            "population": self.population,
+            "population": population_name(played.population) or plain(played.population),
             "seed": self.seed,
         }
 
@@ -68,9 +67,9 @@ def record(
     windows: int,
     *,
     p_conservative: Share = 0.5,
-    population: str = "traits",
+    population: str | Population | None = None,
     seed: int = 0,
-    scene: str = T_INTERSECTION,
+    scene: str | Scene = T_INTERSECTION,
     workers: int = 1,
     fcd: bool = False,
     progress: bool = True,
@@ -78,12 +77,14 @@ def record(
     """Record a dataset of at least ``windows`` windows into ``out`` and return its manifest.
 
     The same call resumes an interrupted recording; a finished one is left as it is. With ``fcd`` the trajectories are
-    written as SUMO's floating-car data, too, also those of a dataset that is there already.
+    written as SUMO's floating-car data, too, also those of a dataset that is there already. The population is the
+    scene's if not given.
 
     Raises:
         InputError: bad values, or ``out`` holds another run.
     """
-    recording = Recording(windows, p_conservative, population, seed, scene)
+    drivers = find_population(population) if isinstance(population, str) else population
+    recording = Recording(windows, p_conservative, drivers, seed, scene)
     try:
         return record_dataset(
             out,

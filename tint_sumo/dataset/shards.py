@@ -5,12 +5,10 @@ dataset does not depend on the number of workers, and an interrupted recording r
 than a shard per process is in memory at a time.
 """
 
-import platform
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from importlib.metadata import version
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -36,6 +34,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, read_json, whole_file, write_json
 from tint_sumo.processes import SPAWN, end_with_parent
 from tint_sumo.progress import make_bar
+from tint_sumo.provenance import versions
 
 EPISODE_STEPS = 500
 _WINDOWS_KEY = b"tint_sumo.windows"
@@ -81,7 +80,7 @@ def record_dataset(
     """
     if workers < 1:
         raise InputError(f"workers must be at least 1, not {workers}")
-    with claim_folder(out, settings):
+    with claim_folder(out, settings, with_versions=False):  # the manifest has them
         finished = _finished(out, parts)
         if finished is not None:
             return finished
@@ -170,8 +169,7 @@ def _contents(out: Path, counts: Sequence[int]) -> dict[str, Any]:
         "rows": rows[TRAJECTORIES],
         "drivers": rows[DRIVERS],
         "shards": len(counts),
-        "versions": {name: version(name) for name in ("tint_sumo", "libsumo", "numpy", "pandas", "pyarrow")}
-        | {"python": platform.python_version()},
+        "versions": versions(("tint_sumo", "libsumo", "numpy", "pandas", "pyarrow")),
     }
 
 

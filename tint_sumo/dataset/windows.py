@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, POPULATIONS, WINDOW_STEPS
+from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, WINDOW_STEPS, Population
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, SCHEMA_VERSION, TRAJECTORIES, read_shards
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
@@ -165,15 +165,20 @@ def load_labels(folder: Path, windows: OfDrivers) -> NDArray[np.int64]:
         InputError: the labels are missing or do not belong to these windows.
     """
     manifest = read_manifest(folder)
-    names = own_vtypes(manifest) or [profile.name for profile in POPULATIONS[manifest["population"]].profiles]
+    names = own_vtypes(manifest) or [profile.name for profile in drivers_of(manifest).profiles]
     drivers, row = _drivers(folder, windows, ["trait"])
     return pd.Index(names).get_indexer(pd.Index(drivers["trait"].astype(str))).astype(np.int64)[row]
 
 
 def own_vtypes(manifest: Mapping[str, Any]) -> list[str] | None:
-    """The vTypes of a dataset of one's own SUMO configuration; None for a built-in population."""
+    """The vTypes of a dataset of one's own SUMO configuration; None for the drivers of a scene."""
     population = manifest["population"]
     return population if isinstance(population, list) else None
+
+
+def drivers_of(manifest: Mapping[str, Any]) -> Population:
+    """The population of a dataset of a scene."""
+    return Population.from_file(manifest["population"], ("population",))
 
 
 def load_drivers(folder: Path, windows: OfDrivers, columns: Sequence[str]) -> pd.DataFrame:

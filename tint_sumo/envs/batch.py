@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tint_sumo.envs.episodes import Episodes, TaskSettings
 from tint_sumo.envs.rendering import render_scene
 from tint_sumo.envs.rows import Rows, outcome_name
+from tint_sumo.timing import StepPart, does
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class LocalBatch:
             self._rngs[index] = rng
         self.episodes.begin(index, rng)
 
+    @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> list[Ended]:
         if not self.episodes.step(actions):
             return []

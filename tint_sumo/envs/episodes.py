@@ -9,12 +9,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from tint_sumo.config import POSITION_SCALE_M, REWARD_PRESETS, SPEED_SCALE_MPS, Backend, Idm, Share
+from tint_sumo.config import POSITION_SCALE_M, REWARD_PRESETS, SPEED_SCALE_MPS, Backend, Share
 from tint_sumo.envs.rows import BOUND, NOBODY, TRACKS, Rows, Scales, TaskRules, judge, observe, observe_tracks, row_type
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, find_scene
 from tint_sumo.scenes.geometry import Floats
 from tint_sumo.simulation.own import make_simulation
+from tint_sumo.timing import StepPart, does
 
 _SEED_LIMIT = 2**63
 
@@ -32,7 +33,7 @@ class TaskSettings:
     reward: str = "paper"
     time_limit_s: float | None = None
     position_noise_m: float = 0.0
-    tau_s: float = Idm.tau_s
+    tau_s: float | None = None
     tracks: bool = False
     backend: Backend = "auto"
 
@@ -46,8 +47,6 @@ class TaskSettings:
             raise InputError(
                 f"time_limit_s must be at least a step of {scene.step_s:g} s, and finite, not {scene.time_limit_s}"
             )
-        if isinstance(scene, Scene) and not scene.step_s <= self.tau_s < math.inf:
-            raise InputError(f"tau_s must be at least a step of {scene.step_s:g} s, and finite, not {self.tau_s}")
 
     @property
     def slot_infos(self) -> tuple[str, ...]:
@@ -57,11 +56,12 @@ class TaskSettings:
     @cached_property
     def played(self) -> Scene | OwnScene:
         """The scene with these settings in place of its own."""
-        scene = find_scene(self.scene) if isinstance(self.scene, str) else self.scene
+        scene = find_scene(self.scene)
         if isinstance(scene, OwnScene):
             return self._own(scene)
-        population = replace(scene.population, idm=replace(scene.population.idm, tau_s=self.tau_s))
-        traffic, time_limit_s = scene.traffic, scene.time_limit_s
+        population, traffic, time_limit_s = scene.population, scene.traffic, scene.time_limit_s
+        if self.tau_s is not None:
+            population = replace(population, idm=replace(population.idm, tau_s=self.tau_s))
         if self.p_conservative is not None:
             traffic = replace(traffic, p_conservative=self.p_conservative)
         if self.time_limit_s is not None:
@@ -69,7 +69,7 @@ class TaskSettings:
         return replace(scene, traffic=traffic, population=population, time_limit_s=time_limit_s)
 
     def _own(self, scene: OwnScene) -> OwnScene:
-        if self.p_conservative is not None or self.tau_s != Idm.tau_s:
+        if self.p_conservative is not None or self.tau_s is not None:
             raise InputError("the demand of a .sumocfg tells who drives how; leave p_conservative and tau_s out")
         return scene if self.time_limit_s is None else replace(scene, time_limit_s=self.time_limit_s)
 
@@ -111,12 +111,14 @@ class Episodes:
         scene = settings.played
         self.simulation = make_simulation(num_envs, scene, settings.backend)
         self.rows = np.zeros(num_envs, row_type(scene.max_vehicles)) if rows is None else rows
-        self._trait_of_member = np.array([*self.simulation.trait_of_member, NOBODY], np.int8)  # the last: empty slots
+        self._trait_of_member = np.array(
+            [*self.simulation.trait_of_member, NOBODY], np.int8
+        )  # the last one stands for empty slots
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
         self._scales = Scales(POSITION_SCALE_M, SPEED_SCALE_MPS, scene.step_s)
         self._speeds_mps = np.array(scene.ego.controller.desired_speeds_mps)
         self.steps = np.zeros(num_envs, np.int64)
-        self._noise: dict[int, np.random.Generator] = {}  # of each environment, where there is noise
+        self._noise: dict[int, np.random.Generator] = {}  # the generator of each environment, if there is noise
         self._noise_m: Floats = np.zeros((num_envs, scene.max_vehicles, 2))
 
     def begin(self, index: int, rng: np.random.Generator) -> None:
@@ -128,6 +130,7 @@ class Episodes:
             self._noise[index] = np.random.default_rng([seed, 1])
         self._observe(slice(index, index + 1))
 
+    @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> bool:
         """Take an action, the number of a desired speed, in each environment; (N,). Whether any episode has ended."""
         simulation = self.simulation
@@ -137,6 +140,7 @@ class Episodes:
         egos = simulation.egos
         return judge(egos.front_m, egos.speed_mps, egos.collided, self.steps, self._rules, self.rows)
 
+    @does(StepPart.OBSERVATION)
     def _observe(self, envs: slice) -> None:
         """Write the observations of some environments, each with noise from its own generator."""
         egos, slots = self.simulation.egos, self.simulation.slots

@@ -1,5 +1,6 @@
 """Top view of one replica of a scene."""
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -27,9 +28,9 @@ _SEAM_M = 0.06  # half of the line between two lanes
 _VTYPES = ((40, 90, 200), (200, 40, 40), (30, 140, 70), (130, 60, 170), (220, 110, 20), (20, 150, 170), (90, 90, 90))
 
 
-def require_render_mode(render_mode: str | None) -> None:
-    if render_mode not in (None, "rgb_array"):
-        raise InputError(f"unknown render_mode {render_mode!r}; choose None or 'rgb_array'")
+def require_render_mode(render_mode: str | None, choices: Sequence[str]) -> None:
+    if render_mode is not None and render_mode not in choices:
+        raise InputError(f"unknown render_mode {render_mode!r}; choose one of None, {', '.join(map(repr, choices))}")
 
 
 def render_scene(simulation: Simulation | OwnSimulation, replica: int) -> NDArray[np.uint8]:

@@ -14,14 +14,14 @@ from tint_sumo.scenes.scene import Scene
 
 Observation = dict[str, NDArray[np.float32]]
 OBSERVATION_KEYS = ("ego", "vehicles", "mask")
-TRACKS = ("position_m", "gap_m", "passed")  # of each vehicle slot, where they are asked for
+TRACKS = ("position_m", "gap_m", "passed")  # per vehicle slot, if they are asked for
 REWARD_TERMS = ("goal", "collision", "speed", "step")
 OUTCOMES = ("success", "timeout", "collision")
-_GOING_ON, _SUCCESS, _TIMEOUT, _COLLISION = range(4)  # in rows: positions in OUTCOMES, plus 1
+_GOING_ON, _SUCCESS, _TIMEOUT, _COLLISION = range(4)  # numbers of outcomes in rows: positions in OUTCOMES, plus 1
 NOBODY = -1  # the trait of an empty slot
-BOUND = 2.0  # of normalised observations: 40 m, 6 m/s
+BOUND = 2.0  # limit of normalised observations: 40 m, 6 m/s
 
-Rows = NDArray[np.void]  # of a type of rows, (N,)
+Rows = NDArray[np.void]  # records (N,) of a row type
 
 
 def row_type(max_vehicles: int) -> np.dtype[np.void]:
@@ -34,7 +34,7 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
             ("mask", np.float32, slots),
             ("traits", np.int8, slots),  # number of the driver's profile, or NOBODY
             ("position_m", np.float64, slots),  # along the route, as observed; 0 in empty slots
-            ("gap_m", np.float64, slots),  # to the leader, as observed; infinite without one
+            ("gap_m", np.float64, slots),  # gap to the leader, as observed; infinite without one
             ("passed", np.int8, slots),  # 1 where the ego has left the vehicle's route behind
             ("time_s", np.float64),
             ("outcome", np.int64),

@@ -9,6 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from tint_sumo.envs.vector import SceneVectorEnv
+from tint_sumo.timing import StepPart, does
 
 
 class SceneVecEnv(VecEnv):
@@ -43,6 +44,7 @@ class SceneVecEnv(VecEnv):
     def step_async(self, actions: NDArray[np.int64]) -> None:
         self._actions = actions
 
+    @does(StepPart.ADAPTER)
     def step_wait(self) -> VecEnvStepReturn:
         observation, reward, terminated, truncated, infos = self.env.step(self._actions)
         done = terminated | truncated

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_actions
 from tint_sumo.envs.rendering import RENDER_FPS, render_scene, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, outcome_name
+from tint_sumo.envs.window import Window
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
 from tint_sumo.simulation.own import OwnSimulation
@@ -94,12 +95,15 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * `reward`: `"paper"` (default) or `"authors"` (the values of the authors' code).
     * `time_limit_s`: default 50 s.
     * `position_noise_m`: standard deviation of the noise on the others' x and y, independent per vehicle and step.
-    * `tau_s`: time headway of the others' car following (SUMO's `tau`); default 1 s.
+    * `tau_s`: time headway of the others' car following (SUMO's `tau`); default the scene's, 1 s in the built-in
+      ones.
     * `tracks`: tell in the infos, too, where vehicles are seen on their routes, with the same noise as in the
       observations; that is what trait models take. Default False.
     * `backend`: `"libsumo"`, `"traci"` (a sumo subprocess), or `"auto"` (default): libsumo if no other environment of
       this process uses it, since libsumo holds one simulation per process.
-    * `render_mode`: `None` or `"rgb_array"`.
+    * `render_mode`: `None`, `"rgb_array"`, or `"human"`: a window follows the episodes in real time. It needs a
+      display and a Python with tkinter; if you close it, the episodes go on without it. The wrapper
+      `gymnasium.wrappers.RecordVideo` takes `"rgb_array"`, and moviepy: `pip install "tint_sumo[video]"`.
 
     ## Version History
     TIntersection:
@@ -109,14 +113,15 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * v0: first release.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012 - gymnasium's way
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012 - gymnasium's way
 
     def __init__(
         self, scene: str | Scene | OwnScene = T_INTERSECTION, render_mode: str | None = None, **task: Any
     ) -> None:
-        require_render_mode(render_mode)
+        require_render_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         settings = TaskSettings(scene, **task)
+        self._window = Window(settings.played.name, RENDER_FPS) if render_mode == "human" else None
         self.observation_space = observation_space(settings.played.max_vehicles)
         self.action_space: gymnasium.spaces.Discrete = action_space(settings.played)
         self._slot_infos = settings.slot_infos
@@ -132,6 +137,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
         self._begin()
+        self._show()
         told = self._told()
         return _observation(told), self._info(told)
 
@@ -144,6 +150,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         actions = np.array([action])
         require_actions(actions, 1, int(self.action_space.n))
         self._step(actions)
+        self._show()
         told = self._told()
         info = self._info(told)
         info["reward_terms"] = {term: told[term] for term in REWARD_TERMS}
@@ -180,6 +187,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._begin()
         for action in snapshot.actions:
             self._step(np.array([action]))
+        self._show()
         told = self._told()
         return _observation(told), self._info(told)
 
@@ -193,12 +201,19 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         return dict(zip(rows.dtype.names or (), rows.item(), strict=True))
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(H, W, 3) image of the scene; conservative drivers blue, aggressive red, the ego yellow."""
-        if self.render_mode is None:
-            return None
-        return render_scene(self._episodes.simulation, 0)
+        """(H, W, 3) image of the scene; conservative drivers blue, aggressive red, the ego yellow.
+
+        None with ``render_mode="human"``, where the window follows by itself.
+        """
+        return render_scene(self._episodes.simulation, 0) if self.render_mode == "rgb_array" else None
+
+    def _show(self) -> None:
+        if self._window:
+            self._window.show(render_scene(self._episodes.simulation, 0))
 
     def close(self) -> None:
+        if self._window:
+            self._window.close()
         self._episodes.simulation.close()
 
 

@@ -15,9 +15,7 @@ from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, copied
 from tint_sumo.envs.workers import WorkerBatch
 from tint_sumo.errors import InputError
-from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
-
-AnyScene = str | Scene | OwnScene
+from tint_sumo.scenes import T_INTERSECTION, AnyScene, OwnScene, Scene
 
 
 class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
@@ -61,7 +59,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise InputError(f"{len(scene)} scenes need as many workers, not {workers}; leave workers out")
         if not 1 <= len(scenes) <= num_envs:
             raise InputError(f"workers must be 1 to num_envs = {num_envs}, not {len(scenes)}")
-        require_render_mode(render_mode)
+        require_render_mode(render_mode, self.metadata["render_modes"])
         all_settings = [TaskSettings(one, **task) for one in scenes]
         settings = all_settings[0]
         if len({one.played.max_vehicles for one in all_settings}) > 1:

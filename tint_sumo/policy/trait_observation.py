@@ -42,7 +42,7 @@ class TraitObservation(VecEnvWrapper):
 
     def reset(self) -> Observation:
         observation = _dictionary(self.venv.reset())
-        self.reset_infos = self.venv.reset_infos  # for a wrapper around this one
+        self.reset_infos = self.venv.reset_infos  # a wrapper around this one reads them
         self.source.begin(Frame(observation, self._slots(), np.ones(self.num_envs, bool)))
         return self._with_traits(observation)
 

@@ -119,7 +119,7 @@ class EncoderTraits(TraitSource):
 
     def attach(self, num_envs: int, max_vehicles: int) -> None:
         super().attach(num_envs, max_vehicles)
-        shape = (num_envs, WINDOW_STEPS, max_vehicles)  # the last steps of each environment, in a ring
+        shape = (num_envs, WINDOW_STEPS, max_vehicles)  # a ring buffer holds the last steps of each environment
         self._steps = np.zeros(num_envs, np.int64)
         self._present = np.zeros(shape, bool)
         self._position_m, self._gap_m = np.zeros(shape), np.zeros(shape)

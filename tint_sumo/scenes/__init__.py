@@ -16,17 +16,23 @@ from tint_sumo.scenes.scene import (
     digest_of,
     find_scene,
 )
+from tint_sumo.scenes.settings import AnyScene, described, read_described, read_scene, scene_settings
 
 __all__ = [
     "ALL_SCENES",
     "SCENES",
     "T_INTERSECTION",
+    "AnyScene",
     "EgoTask",
     "OwnScene",
     "Route",
     "Scene",
     "View",
+    "described",
     "digest_of",
     "find_scene",
     "from_sumocfg",
+    "read_described",
+    "read_scene",
+    "scene_settings",
 ]

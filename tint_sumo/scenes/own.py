@@ -5,6 +5,7 @@ learn their traits takes their vTypes for labels.
 """
 
 import gzip
+import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,15 +21,15 @@ from tint_sumo.config import Claim, EgoController, VehicleShape
 from tint_sumo.errors import InputError
 from tint_sumo.scenes.scene import EgoTask
 
-NET_VERSION = (1, 20)  # of the networks that this SUMO's netconvert writes
+NET_VERSION = (1, 20)  # the version that this SUMO's netconvert writes into networks
 MOST_VTYPES = 127  # labels are numbers of one byte
-DEFAULT_VTYPE = "DEFAULT_VEHTYPE"  # SUMO's, of vehicles that name none
+DEFAULT_VTYPE = "DEFAULT_VEHTYPE"  # SUMO's type for vehicles that name none
 _EGO_CLASS = "passenger"
 _DEFAULT_STEP_S = 1.0  # SUMO's
 # Each of these options and SUMO's other names for it.
 _NET, _ROUTES = ("net-file", "net", "n"), ("route-files", "routes", "r")
 _ADDITIONAL = ("additional-files", "additional", "a")
-_OUTPUTS = ("netstate-dump", "netstate", "log", "message-log", "error-log")  # and all that end with -output
+_OUTPUTS = ("netstate-dump", "netstate", "log", "message-log", "error-log")  # and all options that end with -output
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,15 @@ class SumoConfig:
         """All that the simulation follows from."""
         return (self.file, self.net_file, *self.demand_files)
 
+    @property
+    def digest(self) -> str:
+        """What tells the configuration's input from others'."""
+        whole = hashlib.sha256()
+        for file in self.files:
+            with file.open("rb") as content:
+                whole.update(hashlib.file_digest(content, "sha256").digest())
+        return whole.hexdigest()[:16]
+
 
 @dataclass(frozen=True)
 class OwnScene:
@@ -59,7 +69,7 @@ class OwnScene:
     up to ``sight_m`` away, the nearest ``max_vehicles`` of them.
     """
 
-    claim: ClassVar[Claim] = Claim()  # of nobody's concern: SUMO's own rules tell who yields
+    claim: ClassVar[Claim] = Claim()  # not used: SUMO's own rules decide who yields
 
     name: str
     config: SumoConfig
@@ -67,10 +77,10 @@ class OwnScene:
     ego_route: tuple[str, ...]
     start_m: float
     goal_m: float
-    route_edge_start_m: tuple[float, ...]  # where each edge of the route starts on it
+    route_edge_start_m: tuple[float, ...]  # start of each edge along the route
     max_vehicles: int = 12
     sight_m: float = 50.0
-    warm_up_s: float = 30.0  # of traffic before the ego appears
+    warm_up_s: float = 30.0  # the traffic runs for so long before the ego appears
     time_limit_s: float = 50.0
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     controller: EgoController = field(default_factory=EgoController)
@@ -78,6 +88,10 @@ class OwnScene:
     @property
     def step_s(self) -> float:
         return self.config.step_s
+
+    @property
+    def digest(self) -> str:
+        return self.config.digest
 
     @property
     def ego(self) -> EgoTask:

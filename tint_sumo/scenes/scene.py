@@ -4,12 +4,25 @@ A new scene is a file that makes one, and a line in ``tint_sumo/scenes/__init__.
 """
 
 import hashlib
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, overload
 
-from tint_sumo.config import Claim, EgoController, Population, Traffic, VehicleShape
+from tint_sumo.config import (
+    Claim,
+    EgoController,
+    Population,
+    Traffic,
+    VehicleShape,
+    require_at_least,
+    require_positive,
+)
 from tint_sumo.errors import InputError
 from tint_sumo.scenes.network import Network, Point
+
+if TYPE_CHECKING:
+    from tint_sumo.scenes.own import OwnScene
 
 
 @dataclass(frozen=True)
@@ -27,7 +40,7 @@ class EgoTask:
     edges: tuple[str, ...]
     start_m: float
     goal_m: float  # success when its front is past it
-    way: tuple[Point, ...] = ()  # its front's trace, finer than the lanes' shapes; those if not given
+    way: tuple[Point, ...] = ()  # trace of its front, finer than the lanes' shapes; those shapes if it is not given
     controller: EgoController = field(default_factory=EgoController)
 
 
@@ -59,14 +72,20 @@ class Scene:
     population: Population = field(default_factory=Population)
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     claim: Claim = field(default_factory=Claim)
-    max_vehicles: int = 12  # on the roads, and in an observation (code)
+    max_vehicles: int = 12  # so many are on the roads, and in an observation, at most (code)
     step_s: float = 0.1  # code
     time_limit_s: float = 50.0  # code
+    base: str = ""  # name of the built-in scene that it is with other numbers
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.ego.start_m < self.ego.goal_m:
             start_m, goal_m = self.ego.start_m, self.ego.goal_m
             raise InputError(f"the ego's goal ({goal_m:g} m) must lie beyond its start ({start_m:g} m)")
+        require_at_least(self, 1, "max_vehicles")
+        require_positive(self, "step_s", "time_limit_s")
+        tau_s = self.population.idm.tau_s
+        if not self.step_s <= tau_s < math.inf:  # with less, SUMO's drivers hit each other
+            raise InputError(f"tau_s must be at least a step of {self.step_s:g} s, and finite, not {tau_s}")
 
     @property
     def digest(self) -> str:
@@ -78,7 +97,7 @@ class Scene:
 
 T_INTERSECTION = "t_intersection"  # the paper's scene
 
-ALL_SCENES = "all"  # of a policy that was trained in every scene at once
+ALL_SCENES = "all"  # the scene's name for a policy that was trained in every scene at once
 
 SCENES: dict[str, Callable[[], Scene]] = {}
 
@@ -95,15 +114,21 @@ def register(make: Callable[[], Scene]) -> Callable[[], Scene]:
     return make
 
 
-def find_scene(name: str) -> Scene:
-    """The scene called ``name``.
+@overload
+def find_scene(scene: str | Scene) -> Scene: ...
+@overload
+def find_scene(scene: "str | Scene | OwnScene") -> "Scene | OwnScene": ...
+def find_scene(scene: Any) -> Any:
+    """The scene of a name; a scene itself is given back.
 
     Raises:
         InputError: there is none.
     """
-    if name not in SCENES:
-        raise InputError(f"unknown scene {name!r}; choose one of: {', '.join(SCENES)}")
-    return SCENES[name]()
+    if not isinstance(scene, str):
+        return scene
+    if scene not in SCENES:
+        raise InputError(f"unknown scene {scene!r}; choose one of: {', '.join(SCENES)}")
+    return SCENES[scene]()
 
 
 def digest_of(name: str) -> str:

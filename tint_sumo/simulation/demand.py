@@ -96,7 +96,7 @@ class Demand:
 
     @property
     def entry_m(self) -> float:
-        """Where the fronts of newcomers are."""
+        """Positions of newcomers' fronts."""
         return self._layout.scene.vehicle.length_m
 
     def begin(self, replica: int, seed: np.random.SeedSequence) -> list[PlacedVehicle]:
@@ -117,7 +117,7 @@ class Demand:
         return placed
 
     def stop(self, replica: int) -> None:
-        """Nobody comes any more."""
+        """No driver appears any more."""
         self._wanted_gap_m[replica] = np.inf
 
     def admit(self, slots: Slots, time_s: Floats) -> Iterator[tuple[int, int]]:

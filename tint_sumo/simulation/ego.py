@@ -12,6 +12,7 @@ from tint_sumo.scenes.layout import Layout
 from tint_sumo.scenes.own import OwnScene
 from tint_sumo.scenes.scene import Scene
 from tint_sumo.simulation.slots import EMPTY, Slots
+from tint_sumo.timing import StepPart, does
 
 _STEP_MARGIN_M = 1.0  # more than a vehicle and the ego come closer in a step
 
@@ -20,9 +21,9 @@ _STEP_MARGIN_M = 1.0  # more than a vehicle and the ego come closer in a step
 class Collision:
     """The ego's first collision in an episode."""
 
-    slot: int  # of the other vehicle
-    member: int  # of the population: its driver
-    route: str  # its route
+    slot: int  # slot of the other vehicle
+    member: int  # number of its driver in the population
+    route: str  # name of its route
     ego_x_m: float  # the ego's centre
     ego_y_m: float
 
@@ -39,7 +40,7 @@ class EgoRules(NamedTuple):
     closing_speed_mps: float
     approach_speed_mps: float
     watches_behind: bool
-    half_length_m: float  # of the ego
+    half_length_m: float  # half the length of the ego
     step_s: float
     way_spacing_m: float
 
@@ -86,7 +87,7 @@ class Egos:
         self.speed_mps: Floats = np.zeros(replicas)
         self.pose: Poses = np.zeros(replicas, POSE)
         self.distance_m: Floats = np.full((replicas, scene.max_vehicles), np.inf)
-        self._was_distance_m: Floats = np.full((replicas, scene.max_vehicles), np.inf)  # a step ago
+        self._was_distance_m: Floats = np.full((replicas, scene.max_vehicles), np.inf)  # distances one step ago
         self.unsafe: Bools = np.zeros(replicas, bool)
         self.has_claimed: Bools = np.zeros((replicas, routes), bool)
         self.claim_changed: Bools = np.zeros((replicas, routes), bool)
@@ -99,14 +100,14 @@ class Egos:
         return np.asarray(self._hit_slot != EMPTY)
 
     def begin(self, replica: int) -> None:
-        """An ego stands at its start."""
+        """Put an ego at its start, where it stands."""
         self.forget(replica)
         self.front_m[replica] = self._layout.scene.ego.start_m
         self.speed_mps[replica] = 0.0
         self._place(slice(replica, replica + 1))
 
     def forget(self, replica: int) -> None:
-        """Nothing has happened in a replica yet."""
+        """Forget what happened in a replica."""
         self.distance_m[replica] = np.inf
         self._was_distance_m[replica] = np.inf
         self.unsafe[replica] = False
@@ -123,6 +124,7 @@ class Egos:
         drive(desired_mps, self.unsafe, self._rules, self.speed_mps, self.front_m)
         self._place(slice(None))
 
+    @does(StepPart.CLAIMS)
     def update_claims(self) -> bool:
         """Claim routes and give them up; ``claim_changed`` (R, K) tells where that changed, the answer whether any."""
         zones = self._layout.zones
@@ -137,6 +139,7 @@ class Egos:
             self.claim_changed,
         )
 
+    @does(StepPart.SAFETY_CHECK)
     def look_around(self, slots: Slots) -> None:
         """Run the safety check for the next step, and latch collisions."""
         shape = self._layout.scene.vehicle

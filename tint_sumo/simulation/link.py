@@ -13,6 +13,7 @@ from tint_sumo.scenes.geometry import Floats, Numbers
 from tint_sumo.scenes.layout import EGO, Layout
 from tint_sumo.scenes.network import name
 from tint_sumo.simulation.connection import Connection, connect
+from tint_sumo.timing import StepPart, does
 
 SPEED_MODE_OBEY_SETSPEED = 32  # all of SUMO's own checks off: the ego drives exactly the speed it is given
 _IGNORE_ON_JUNCTION = "junctionModel.ignoreTypes"
@@ -38,7 +39,7 @@ class SumoLink:
         self._vehicle = self.connection.vehicle
         self.ids = [[""] * self._slots for _ in range(replicas)]
         self.ego_ids = [""] * replicas
-        self.index: dict[str, int] = {}  # of each vehicle's slot among all replicas' slots
+        self.index: dict[str, int] = {}  # number of each vehicle's slot among all replicas' slots
         self._episodes = [0] * replicas
 
     def begin_episode(self, replica: int) -> None:
@@ -96,7 +97,7 @@ class SumoLink:
 
     def step(self) -> Iterator[tuple[int, int]]:
         """Simulate a step; replica and slot of each vehicle that has left the network."""
-        self.connection.step()
+        self._simulate()
         for vehicle_id in self.connection.simulation.getArrivedIDList():
             if vehicle_id in self.index:
                 replica, slot = divmod(self.index[vehicle_id], self._slots)
@@ -105,6 +106,11 @@ class SumoLink:
             elif vehicle_id in self.ego_ids:
                 self.ego_ids[self.ego_ids.index(vehicle_id)] = ""
 
+    @does(StepPart.SUMO)
+    def _simulate(self) -> None:
+        self.connection.step()
+
+    @does(StepPart.GETTERS)
     def lane_positions_m(self) -> tuple[Numbers, Floats]:
         """Indices (N,) of the vehicles' slots, and where their fronts are on their SUMO lanes (N,)."""
         count = len(self.index)

@@ -28,8 +28,8 @@ from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.simulation.slots import EMPTY
 
 EGO = "tint_sumo.ego"  # vehicle, vType and route; no user's id
-_ONLY_STRATEGIC_CHANGES = 513  # of lanes: those that the route asks for, where there is room
-_ENTRY_PATIENCE_S = 60.0  # for how long the ego waits for room at its start
+_ONLY_STRATEGIC_CHANGES = 513  # lane changes: those that the route asks for, where there is room
+_ENTRY_PATIENCE_S = 60.0  # the ego waits for room at its start for so long
 _SEEN = (constants.VAR_POSITION, constants.VAR_ANGLE, constants.VAR_DISTANCE, constants.VAR_SPEED)
 _SEED_BITS = 31
 
@@ -124,8 +124,8 @@ class OwnSlots:
         self.width_m: Floats = np.zeros(shape)
         self.member: Numbers = np.full(shape, EMPTY)
         self.vehicle_number: Numbers = np.full(shape, EMPTY)
-        self.slot: dict[str, int] = {}  # of each vehicle by its id
-        self._number: dict[str, int] = {}  # of each vehicle that has been seen
+        self.slot: dict[str, int] = {}  # slot of each vehicle, by id
+        self._number: dict[str, int] = {}  # number of each vehicle that has been seen
 
     def clear(self) -> None:
         for vehicle_id in list(self.slot):
@@ -177,7 +177,7 @@ class OwnEgos:
         self.speed_mps: Floats = np.zeros(1)
         self.pose: Poses = np.zeros(1, POSE)
         self.distance_m: Floats = np.full((1, scene.max_vehicles), np.inf)
-        self._was_distance_m: Floats = np.full((1, scene.max_vehicles), np.inf)  # a step ago
+        self._was_distance_m: Floats = np.full((1, scene.max_vehicles), np.inf)  # distances one step ago
         self.unsafe: Bools = np.zeros(1, bool)
         self._hit_slot: Numbers = np.full(1, EMPTY)
         self.collision: list[Collision | None] = [None]
@@ -250,7 +250,7 @@ class OwnSimulation:
         self._drives = False
         self.slots = OwnSlots(scene.max_vehicles)
         self.egos = OwnEgos(scene)
-        self.origin_m = (0.0, 0.0)  # in the network
+        self.origin_m = (0.0, 0.0)  # position of the scene's origin in the network
 
     @property
     def backend(self) -> str:

@@ -21,6 +21,7 @@ from tint_sumo.simulation.ego import Egos
 from tint_sumo.simulation.link import NO_COLLISION_CHECK, SumoLink
 from tint_sumo.simulation.slots import Slots
 from tint_sumo.simulation.yielding import Yielding
+from tint_sumo.timing import StepPart, does
 
 
 class Simulation:
@@ -57,7 +58,7 @@ class Simulation:
         self.yielding = Yielding(replicas, self.population, self.layout, self.slots, self.link)
         self._demand = Demand(replicas, self.population, self.layout)
         self.time_s: Floats = np.zeros(replicas)
-        self.vehicle_count = [0] * replicas  # that have appeared in each replica's episode
+        self.vehicle_count = [0] * replicas  # vehicles that have appeared in each replica's episode
 
     @property
     def backend(self) -> str:
@@ -69,11 +70,15 @@ class Simulation:
 
     # Episodes
 
+    @does(StepPart.SPAWNING)
     def reset(self, replica: int, seed: int | Sequence[int] | np.random.SeedSequence) -> None:
         """Empty a replica and start a new random episode in it."""
         sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
         self.clear(replica)
-        self._populate(replica, self._demand.begin(replica, sequence))
+        placed = self._demand.begin(replica, sequence)
+        if len(placed) > self.scene.max_vehicles:  # those who would have come last are not there yet
+            placed = sorted(placed, key=lambda one: -one.front_m)[: self.scene.max_vehicles]
+        self._populate(replica, placed)
 
     def reset_to(self, replica: int, vehicles: Sequence[PlacedVehicle]) -> None:
         """Empty a replica and start an episode with exactly these vehicles; nobody else enters.
@@ -137,6 +142,7 @@ class Simulation:
             self.egos.look_around(self.slots)
         self._admit()
 
+    @does(StepPart.SPAWNING)
     def _admit(self) -> None:
         """Let the upcoming drivers in where there is room, a free slot, and their time has come."""
         for replica, route in self._demand.admit(self.slots, self.time_s):

@@ -38,12 +38,14 @@ class Slots:
         self.member: Numbers = np.full(shape, EMPTY)
         self.vehicle_number: Numbers = np.full(shape, EMPTY)
         self._lane_pos_m: Floats = np.zeros(shape)
-        self._was_present: Bools = np.zeros(shape, bool)  # at the previous step; such a slot takes no new vehicle yet
+        self._was_present: Bools = np.zeros(
+            shape, bool
+        )  # whether it was there at the previous step: then the slot takes no new vehicle yet
         self._newcomer, self._newcomer_pos_m = np.zeros(1, np.int64), np.zeros(1)
         self.newest: Numbers = np.full((replicas, len(layout.routes)), EMPTY)  # slot of each route's last newcomer
 
     def take(self, replica: int, slot: int, route: int, front_m: float, member: int, number: int) -> None:
-        """A vehicle appears in an empty slot."""
+        """Take over a vehicle that appears in an empty slot."""
         stage, lane_pos_m = self._layout.routes[route].lane_at(front_m)
         self.present[replica, slot] = True
         self.route[replica, slot] = route
@@ -56,7 +58,7 @@ class Slots:
         self.follow(self._newcomer, self._newcomer_pos_m)
 
     def leave(self, replica: int, slot: int) -> None:
-        """A vehicle has left the roads."""
+        """Empty the slot of a vehicle that has left the roads."""
         self.present[replica, slot] = False
         self.member[replica, slot] = EMPTY
         self.vehicle_number[replica, slot] = EMPTY
@@ -68,7 +70,7 @@ class Slots:
         np.copyto(self._was_present, self.present)
 
     def rest(self, replica: int) -> None:
-        """All slots of a replica may be taken at once."""
+        """Empty all slots of a replica, which may be taken at once."""
         self._was_present[replica] = False
 
     def free(self, replica: int) -> int:
@@ -77,7 +79,7 @@ class Slots:
         return int(free[0]) if len(free) else EMPTY
 
     def index(self, replica: int, slot: int) -> int:
-        """Of a slot among all replicas' slots."""
+        """Number of a slot among all replicas' slots."""
         return replica * int(self.present.shape[1]) + slot
 
     def follow(self, index: Numbers, lane_pos_m: Floats) -> None:

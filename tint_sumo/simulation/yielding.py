@@ -8,6 +8,7 @@ from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.ego import Egos
 from tint_sumo.simulation.link import SumoLink
 from tint_sumo.simulation.slots import Slots
+from tint_sumo.timing import StepPart, does
 
 
 class Yielding:
@@ -28,6 +29,7 @@ class Yielding:
         """Which slots hold a driver whose trait it is to yield; (R, V)."""
         return np.asarray(self._yields[self._slots.member])
 
+    @does(StepPart.CLAIMS)
     def answer(self, egos: Egos) -> None:
         """Let drivers react to claims that are new, and drive on where a claim was given up."""
         slots = self._slots
@@ -50,7 +52,7 @@ class Yielding:
             self._set(replica, slot, True)
 
     def leave(self, replica: int, slot: int) -> None:
-        """A driver has left the roads."""
+        """Forget a driver that has left the roads."""
         self.reacts[replica, slot] = False
 
     def _set(self, replica: int, slot: int, reacts: bool) -> None:

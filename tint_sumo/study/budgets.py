@@ -1,11 +1,23 @@
 """What a study runs: everything that sets its cost and its quality, in one place."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
-from tint_sumo.config import P_CONSERVATIVE, Idm, PolicySettings, PpoSettings, Share, TraitSettings
+from tint_sumo.config import (
+    P_CONSERVATIVE,
+    Idm,
+    PolicySettings,
+    PpoSettings,
+    Share,
+    TraitSettings,
+    require_at_least,
+    require_positive,
+    require_share,
+)
 from tint_sumo.errors import InputError
 
 ALL_MIXES: Share = (0.1, 0.9)  # P(conservative) is drawn from this range in every episode
+SNAPSHOTS_PERCENT = (25, 50)  # of a training, after which the policy is kept, too
 
 
 @dataclass(frozen=True)
@@ -15,12 +27,25 @@ class Conditions:
     p_conservative: Share
     position_noise_m: float = 0.0
     tau_s: float = Idm.tau_s
-    percent: int = 100  # of the training
+    percent: int = 100  # part of the training after which the policy is tested
+
+    def __post_init__(self) -> None:
+        require_share(self.p_conservative)
+        require_at_least(self, 0, "position_noise_m")
+        require_positive(self, "tau_s")
+        if self.percent not in (*SNAPSHOTS_PERCENT, 100):
+            raise InputError(f"percent must be one of 25, 50, 100, when policies are kept, not {self.percent}")
 
     @property
     def is_single_mix(self) -> bool:
         """Whether all cases have one P(conservative), and nothing else differs from the world of the training."""
         return isinstance(self.p_conservative, float) and self == Conditions(self.p_conservative)
+
+    @property
+    def world(self) -> dict[str, Any]:
+        """What the environments are told; the headway is the scene's unless another one is tested."""
+        told = {"p_conservative": self.p_conservative, "position_noise_m": self.position_noise_m}
+        return told if self.tau_s == Idm.tau_s else {**told, "tau_s": self.tau_s}
 
     @property
     def label(self) -> str:
@@ -40,20 +65,34 @@ class Trials:
     conditions: tuple[Conditions, ...]
     episodes: int
 
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "episodes")
+
 
 @dataclass(frozen=True)
 class Budget:
     """Sizes of all stages of a study."""
 
-    traits: TraitSettings | None  # of the trait models it learns; None: it takes the shipped ones
-    windows: int = 0  # to record for them
+    traits: TraitSettings | None  # settings of the trait models that it learns; None: it takes the shipped ones
+    windows: int = 0  # windows to record for them
     record_p_conservative: float = 0.5  # share of conservative drivers in the dataset
-    ppo: PpoSettings = field(default_factory=PpoSettings)  # with the steps of every policy
+    ppo: PpoSettings = field(default_factory=PpoSettings)  # settings of PPO, and the steps of every policy
     methods: tuple[str, ...] = ("always_go", "ttc", "no_labels", "vae", "oracle")
     mixes: tuple[Share, ...] = (ALL_MIXES,)  # P(conservative) in training: a policy for each
     seeds: tuple[int, ...] = (0, 1, 2)
     trials: tuple[Trials, ...] = ()
     with_shipped: bool = False  # test the shipped policies, too
+
+    def __post_init__(self) -> None:
+        for name in ("methods", "mixes", "seeds"):
+            values = getattr(self, name)
+            if len(set(values)) < max(1, len(values)):
+                raise InputError(f"{name} must be one or more, each of them once, not {list(values)}")
+        for mix in (self.record_p_conservative, *self.mixes):
+            require_share(mix)
+        require_at_least(self, 0, "seeds")
+        if self.traits is not None:
+            require_at_least(self, 1, "windows")
 
 
 # A small network is as accurate here as the paper's, trains in minutes and encodes 768 windows in less than 2 ms.
@@ -68,8 +107,8 @@ _FULL = TraitSettings(
 )
 
 TRAIT_BUDGETS = {
-    "quick": replace(_FULL, batch_size=256, epochs=20),  # for some 30,000 windows
-    "full": _FULL,  # for the paper's 696,000
+    "quick": replace(_FULL, batch_size=256, epochs=20),  # meant for some 30,000 windows
+    "full": _FULL,  # meant for the paper's 696,000
     "paper": TraitSettings(),
 }
 
@@ -80,7 +119,7 @@ _FULL_PPO = PpoSettings(
     n_epochs=4,
     n_minibatches=8,
     learning_rate=3e-3,
-    gamma=0.999,  # of a decision of 0.4 s; with less, a small risk pays more than waiting for the next gap
+    gamma=0.999,  # per decision of 0.4 s; with less, a small risk pays more than waiting for the next gap
     ent_coef=0.01,
     final_ent_coef=0.0,  # tests take the likeliest actions: what succeeds by chance must become likely
     vf_coef=0.02,  # returns are near 8: with more, their errors drown the actor's gradient in the shared layers
@@ -143,6 +182,9 @@ BUDGETS = {
         trials=(Trials(tuple(Conditions(p) for p in P_CONSERVATIVE), 500),),  # paper IV-C
     ),
 }
+
+
+PPO_BUDGETS = {name: budget.ppo for name, budget in BUDGETS.items()}
 
 
 def find_budget(name: str) -> Budget:

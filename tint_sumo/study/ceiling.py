@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import Share
 from tint_sumo.envs.episodes import episode_seed
-from tint_sumo.scenes import T_INTERSECTION, find_scene
+from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene
 from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.study.evaluation import BATCH, case_seed
 
 
-def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str = T_INTERSECTION) -> float:
+def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str | Scene = T_INTERSECTION) -> float:
     """Share of the cases in which enough yielding drivers come in time.
 
     A careful ego enters a route only before a driver that yields. It knows all traits, never brakes on its way and
@@ -23,7 +23,7 @@ def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str = T_
 
     Args:
         p_conservative, episodes, seed: of the cases, see ``tint_sumo.study.evaluation.evaluate``.
-        scene: name of the scene.
+        scene: name of the scene, or a scene of one's own.
     """
     played = find_scene(scene)
     played = replace(played, traffic=replace(played.traffic, p_conservative=p_conservative))
@@ -71,7 +71,7 @@ def _openings(simulation: Simulation) -> list[list[list[tuple[float, float]]]]:
     scene, slots, stop_line_m = simulation.scene, simulation.slots, simulation.layout.zones.stop_line_m
     routes, length_m = range(len(stop_line_m)), scene.vehicle.length_m
     openings: list[list[list[tuple[float, float]]]] = [[[] for _ in routes] for _ in range(simulation.replicas)]
-    free_since_s = np.zeros((simulation.replicas, len(routes)))  # when the last vehicle had passed
+    free_since_s = np.zeros((simulation.replicas, len(routes)))  # time at which the last vehicle had passed
     for step in range(round(scene.time_limit_s / scene.step_s)):
         number, past_m = slots.vehicle_number.copy(), slots.front_m - stop_line_m[slots.route]
         time_s = (step + 1) * scene.step_s

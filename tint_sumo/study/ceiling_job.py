@@ -5,7 +5,9 @@ from pathlib import Path
 
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, write_json
-from tint_sumo.progress import Report
+from tint_sumo.progress import Progress, Report
+from tint_sumo.scenes import T_INTERSECTION, Scene
+from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Trials
 from tint_sumo.study.ceiling import ceiling
 from tint_sumo.study.policy_jobs import CASES
@@ -19,8 +21,10 @@ class CeilingJob:
 
     trials: tuple[Trials, ...]
     out: Path  # of the study
+    scene: str | Scene = T_INTERSECTION
 
     name = "ceilings"
+    title = Title("ceilings")
     needs: tuple[str, ...] = ()
 
     def is_done(self) -> bool:
@@ -33,10 +37,12 @@ class CeilingJob:
             for one in trials.conditions
             if one.is_single_mix and isinstance(one.p_conservative, float)
         }
-        found = {}
-        for done, (p_conservative, episodes) in enumerate(wanted.items()):
-            report(done, len(wanted), f"P {p_conservative:g}")
-            found[f"{p_conservative:g}"] = ceiling(p_conservative, episodes, CASES)
+        found: dict[str, float] = {}
+        done, total = 0, sum(wanted.values())
+        for p_conservative, episodes in wanted.items():
+            report(Progress(done, total, "case"))
+            found[f"{p_conservative:g}"] = ceiling(p_conservative, episodes, CASES, self.scene)
+            done += episodes
         write_json(self.out / CEILINGS_FILE, found)
         return ", ".join(f"P {p}: {share:.1%}" for p, share in found.items())
 

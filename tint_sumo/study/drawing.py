@@ -100,9 +100,9 @@ class Artist:
         image = Image.new("RGB", SIZE_PX, _PAPER)
         draw, top = ImageDraw.Draw(image), SIZE_PX[1] - 46
         draw.text((10, 6), self.title, font=_font(15), fill=_INK)
-        conservative, aggressive = (_parts(profile.colour) for profile in self.layout.scene.population.profiles)
-        left = _key(draw, (10, top), "true trait: conservative", outline=conservative)
-        left = _key(draw, (left, top), "aggressive", outline=aggressive)
+        first, second = self.layout.scene.population.profiles
+        left = _key(draw, (10, top), f"true trait: {first.name}", outline=_parts(first.colour))
+        left = _key(draw, (left, top), second.name, outline=_parts(second.colour))
         left = _key(draw, (left, top), "brakes", outline=_LAMP, fill=_LAMP)
         left = _key(draw, (left, top), "claimed lane", fill=_CLAIM_KEY)
         if self.has_attention:
@@ -111,8 +111,8 @@ class Artist:
         if self.reader is None:
             draw.text((10, below), "nobody tells this policy the others' traits", font=_font(13), fill=_FAINT)
             return image
-        left = _key(draw, (10, below), "inferred trait: conservative", fill=conservative)
-        left = _key(draw, (left, below), "aggressive", fill=aggressive)
+        left = _key(draw, (10, below), f"inferred trait: {first.name}", fill=_parts(first.colour))
+        left = _key(draw, (left, below), second.name, fill=_parts(second.colour))
         left = _key(draw, (left, below), "unsure", fill=_UNSURE)
         _key(draw, (left, below), "nothing inferred", outline=_FAINT, fill=_WHITE)
         return image

@@ -30,6 +30,7 @@ class Moment:
     ego_brakes: bool
     is_held: bool  # the ego's safety check overrides the policy
     present: Bools  # (V,)
+    vehicles: Numbers  # (V,) running numbers of the vehicles in the episode, -1 in empty slots
     poses: Poses  # (V,)
     brakes: Bools  # (V,)
     traits: Numbers  # (V,) true ones: numbers of profiles, -1 in empty slots
@@ -168,6 +169,7 @@ def _moment(stage: _Stage, driver: _Driver, speeds: _Speeds, desired_mps: float 
         ego_brakes=ego_brakes,
         is_held=bool(egos.unsafe[0]),
         present=slots.present[0].copy(),
+        vehicles=slots.vehicle_number[0].copy(),
         poses=slots.pose[0].copy(),
         brakes=brakes,
         traits=stage.info["traits"].astype(np.int64),

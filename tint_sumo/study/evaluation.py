@@ -1,7 +1,7 @@
 """Every method meets the same unseen cases."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
-from tint_sumo.progress import Report, silent
+from tint_sumo.progress import Progress, Report, silent
 from tint_sumo.study.methods import Policy
 from tint_sumo.study.statistics import Rate
 
@@ -110,8 +110,7 @@ def evaluate(
             wanted = min(venv.num_envs, episodes - first)
             for index, case in _first_episodes(policy, venv, case_seed(seed, first), wanted):
                 cases[first + index] = case
-                successes = sum(one.outcome == "success" for one in cases.values())
-                report(len(cases), episodes, f"success {successes / len(cases):.0%}")
+                report(Progress(len(cases), episodes, "case", _shares(cases.values())))
     finally:
         venv.close()
     return Evaluation(tuple(cases[number] for number in range(episodes)))
@@ -132,6 +131,12 @@ def _first_episodes(policy: Policy, venv: VecEnv, first_seed: int, wanted: int) 
         if ended:
             running &= ~starts
             venv.env_method("park", indices=ended)
+
+
+def _shares(cases: Collection[Case]) -> dict[str, float]:
+    """What a report tells of the cases so far."""
+    ends = Counter(case.outcome for case in cases)
+    return {outcome: ends[outcome] / len(cases) for outcome in ("success", "collision")}
 
 
 def _case(info: dict[str, Any]) -> Case:

@@ -1,7 +1,6 @@
 """Figures of a study's results."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,9 @@ from matplotlib.figure import Figure
 from tint_sumo.config import ends
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.files import whole_file
-from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.methods import METHODS
-from tint_sumo.study.rows import Row
+from tint_sumo.study.policy_jobs import smoothed_percent
+from tint_sumo.study.rows import WORLDS, Row, by_title, varied
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
 INK = {"success": "white", "timeout": "black", "collision": "white"}  # colours of the numbers on these colours
@@ -89,8 +88,7 @@ def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Pat
     figure = Figure(figsize=(7.5, 4.6), dpi=150, layout="constrained")
     axes = figure.subplots()
     for position, (method, seeds) in enumerate(curves.items()):
-        shares = [one.set_index("decisions")["success"].rolling(5, min_periods=1).mean() for one in seeds]
-        percent = 100.0 * pd.concat(shares, axis=1).dropna()
+        percent = smoothed_percent(seeds)
         style = _line_style(position) | {"markevery": 0.12}
         axes.plot(percent.index, percent.mean(axis=1), label=METHODS[method].title, **style)
         axes.fill_between(
@@ -106,13 +104,8 @@ def plot_worlds(rows: Sequence[Row], file: Path) -> Path:
     """Success in worlds other than the training's, and after parts of the training; a line per method."""
     figure = Figure(figsize=(11.0, 4.2), dpi=150, layout="constrained")
     all_axes = figure.subplots(1, 3, sharey=True)
-    panels = (
-        ("position_noise_m", "noise on positions (m)"),
-        ("tau_s", "headway tau of the drivers (s)"),
-        ("percent", "part of the training (%)"),
-    )
-    for axes, (name, title) in zip(all_axes, panels, strict=True):
-        for position, (_, own) in enumerate(_by_method(rows).items()):
+    for axes, (name, title) in zip(all_axes, WORLDS.items(), strict=True):
+        for position, own in enumerate(by_title(rows).values()):
             _plot_line(axes, own, name, position)
         axes.set_xlabel(title)
         axes.grid(alpha=0.25)
@@ -123,12 +116,8 @@ def plot_worlds(rows: Sequence[Row], file: Path) -> Path:
 
 
 def _plot_line(axes: Axes, rows: Sequence[Row], name: str, position: int) -> None:
-    """Rows that differ from the training's world in one condition."""
-    base = Conditions(rows[0].conditions.p_conservative)
-    shown = [row for row in rows if replace(row.conditions, **{name: getattr(base, name)}) == base]
-    points = {getattr(row.conditions, name): row for row in shown}
-    if points:
-        values = sorted(points)
+    if points := varied(rows, name):
+        values = list(points)
         percent = np.array([100.0 * points[value].rate("success") for value in values])
         limits = np.array([[100.0 * end for end in points[value].intervals["success"]] for value in values]).T
         style = _line_style(position) | {"capsize": 2}
@@ -138,13 +127,6 @@ def _plot_line(axes: Axes, rows: Sequence[Row], name: str, position: int) -> Non
 def _line_style(position: int) -> dict[str, Any]:
     """Lines differ in colour and marker."""
     return {"color": f"C{position}", "marker": _MARKERS[position % len(_MARKERS)], "ms": 4, "lw": 1.2}
-
-
-def _by_method(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    found: dict[str, list[Row]] = {name: [] for name in METHODS}
-    for row in rows:
-        found.setdefault(row.method, []).append(row)
-    return {name: own for name, own in found.items() if own}
 
 
 def _write(figure: Figure, file: Path) -> Path:

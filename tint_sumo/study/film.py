@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from tint_sumo.config import Share, ends
+from tint_sumo.config import Share, share_words
 from tint_sumo.envs.rendering import RENDER_FPS
 from tint_sumo.errors import InputError
 from tint_sumo.files import whole_file
-from tint_sumo.progress import Report, silent
-from tint_sumo.scenes import find_scene
+from tint_sumo.progress import Progress, Report, silent
+from tint_sumo.scenes import OwnScene, Scene, find_scene
 from tint_sumo.scenes.layout import layout
 from tint_sumo.study.drawing import SIZE_PX, Artist
 from tint_sumo.study.driving import Moment, drive_case
@@ -66,14 +66,26 @@ def render_case(
     if not 0 <= case < CASES_PER_SEED:
         raise InputError(f"case must lie in 0 to {CASES_PER_SEED - 1}, not {case}")
     share = contender.p_conservative if p_conservative is None else p_conservative
+    played = _require_film_scene(contender)
     moments = list(drive_case(contender, case, seed, p_conservative=share, **task))
     shown = _spread(moments) if out.suffix == ".png" else moments
-    parts = (Path(contender.name).name, contender.scene, f"case {case} of set {seed}", _words(share))
+    parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(share))
     has_attention = moments[0].attention is not None
-    artist = Artist(layout(find_scene(contender.scene)), (" " * 5).join(parts), fit_reader(contender), has_attention)
+    artist = Artist(layout(played), (" " * 5).join(parts), fit_reader(contender), has_attention)
     with whole_file(out) as partial:
         _WRITERS[out.suffix](partial, artist, shown, report)
     return Film(moments[-1].outcome, round(moments[-1].time_s, 3), len(shown))
+
+
+def _require_film_scene(contender: Contender) -> Scene:
+    """The contender's scene; InputError unless a film can show it."""
+    scene = find_scene(contender.scene)
+    if isinstance(scene, OwnScene):
+        raise InputError(f"scene {scene.name} is a SUMO configuration; films show built-in scenes only")
+    count = len(scene.population.profiles)
+    if count != 2:
+        raise InputError(f"a film shows drivers of two profiles, and scene {scene.name} has {count}")
+    return scene
 
 
 def require_film_file(out: Path) -> None:
@@ -93,15 +105,15 @@ def _spread(moments: Sequence[Moment]) -> list[Moment]:
     return [moments[index] for index in np.linspace(0, len(moments) - 1, across * down).round().astype(int).tolist()]
 
 
-def _words(share: Share) -> str:
-    low, high = ends(share)
-    return f"P(conservative) {low:g}" + (f" to {high:g}" if high > low else "")
+def _words(share: Share | None) -> str:
+    assert share is not None  # it is None in a SUMO configuration alone
+    return f"P(conservative) {share_words(share)}"
 
 
 def _frames(artist: Artist, moments: Sequence[Moment], report: Report) -> Iterator[Image.Image]:
     for done, moment in enumerate(moments, start=1):
         yield artist.frame(moment)
-        report(done, len(moments), "")
+        report(Progress(done, len(moments), "frame"))
 
 
 def _write_strip(file: Path, artist: Artist, moments: Sequence[Moment], report: Report) -> None:

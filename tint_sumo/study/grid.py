@@ -6,57 +6,81 @@ from pathlib import Path
 from tint_sumo.dataset.recorder import record
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder
+from tint_sumo.scenes import T_INTERSECTION, Scene, described, digest_of, find_scene
 from tint_sumo.study.budgets import Budget
 from tint_sumo.study.ceiling_job import CeilingJob
 from tint_sumo.study.loading import shipped_policies
 from tint_sumo.study.methods import Learned, find_method
+from tint_sumo.study.page import write_page
 from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
 from tint_sumo.study.pool import Job, run_jobs
 from tint_sumo.study.report import StudyReport, write_report
 from tint_sumo.study.trait_job import DATASET, SEED, TraitJob
 
 
-def plan(budget: Budget, out: Path) -> list[Job]:
+def plan(budget: Budget, out: Path, scene: str | Scene = T_INTERSECTION) -> list[Job]:
     """All jobs after the recording, those that hold up others or take longest first, one seed after the other."""
     found = [find_method(name) for name in budget.methods]
     learned = [method for method in found if isinstance(method, Learned)]
     rules = [method.name for method in found if not isinstance(method, Learned)]
     encoders = dict.fromkeys(method.encoder for method in learned if method.encoder)
     traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
-    given = rules + (shipped_policies() if budget.with_shipped else [])
+    given = rules + (shipped_policies() if budget.with_shipped and scene == T_INTERSECTION else [])
     jobs: list[Job] = [*traits]
     for seed in budget.seeds:
         grid = [(method.name, mix, seed) for mix in budget.mixes for method in learned]
-        trainings = [TrainJob(*policy, budget.ppo, budget.traits is None, out) for policy in grid]
+        trainings = [TrainJob(*policy, budget.ppo, budget.traits is None, out, scene) for policy in grid]
         jobs += sorted(trainings, key=lambda job: len(job.needs))
-        jobs += [EvaluateJob(*policy, budget.trials, out) for policy in grid]
-    return [*jobs, CeilingJob(budget.trials, out), *(EvaluateJob(name, None, 0, budget.trials, out) for name in given)]
+        jobs += [EvaluateJob(*policy, budget.trials, out, scene) for policy in grid]
+    tests = [EvaluateJob(name, None, 0, budget.trials, out, scene) for name in given]
+    return [*jobs, CeilingJob(budget.trials, out, scene), *tests]
 
 
-def run_study(budget: Budget, out: Path, *, workers: int = 2, progress: bool = True) -> StudyReport:
+def run_study(
+    budget: Budget, out: Path, *, scene: str | Scene = T_INTERSECTION, workers: int = 2, progress: bool = True
+) -> StudyReport:
     """Run the study into ``out``; what an earlier, interrupted call has finished is not repeated.
 
     Args:
         budget: sizes of all stages.
         out: a new folder, or the one of this very study.
+        scene: where everybody drives; the shipped policies, which know the paper's scene, are tested there alone.
         workers: processes at a time.
         progress: show progress bars on stderr.
 
     Raises:
-        InputError: ``out`` holds another run, or a stage was refused.
+        InputError: ``out`` holds another run, the scene does not fit the budget, or a stage was refused.
     """
     if workers < 1:
         raise InputError(f"workers must be at least 1, not {workers}")
-    jobs = plan(budget, out)
-    with claim_folder(out, {"kind": "study", **asdict(budget)}):
+    _require_scene(budget, scene)
+    jobs = plan(budget, out, scene)
+    place = {} if scene == T_INTERSECTION else described(scene)
+    with claim_folder(out, {"kind": "study", **asdict(budget), **place}):
         if budget.traits is not None:
             record(
                 out / DATASET,
                 budget.windows,
                 p_conservative=budget.record_p_conservative,
                 seed=SEED,
+                scene=scene,
                 workers=workers,
                 progress=progress,
             )
         run_jobs(jobs, workers, progress)
-        return write_report(out)
+        return write_page(write_report(out), out, workers=workers, progress=progress)
+
+
+def _require_scene(budget: Budget, scene: str | Scene) -> None:
+    """Raise InputError unless a study can be made there."""
+    found = find_scene(scene)
+    if not isinstance(found, Scene):
+        raise InputError(f"a study needs a built-in scene, or one with other numbers, not {found.name}")
+    count = len(found.population.profiles)
+    if count != 2:
+        raise InputError(f"a study is of two profiles of drivers, and scene {found.name} has {count}")
+    if budget.traits is None and found.digest != digest_of(T_INTERSECTION):
+        raise InputError(
+            f"the shipped trait models know the scene {T_INTERSECTION}, not {found.name}; give the budget traits, and "
+            "windows to learn them from, as the budget quick has"
+        )

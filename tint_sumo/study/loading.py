@@ -1,5 +1,6 @@
 """Policies by name or path, ready to be evaluated."""
 
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,8 +16,9 @@ from tint_sumo.files import shipped
 from tint_sumo.policy import RecurrentPPO, TraitSource
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
 from tint_sumo.policy.venv import policy_venv
-from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, digest_of, find_scene
+from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnScene, find_scene, read_described
 from tint_sumo.study.methods import METHODS, Learned, Policy, Rule, find_learned
+from tint_sumo.study.rules import ACTIONS as RULE_ACTIONS
 from tint_sumo.study.training import POLICY, TRAITS, digest
 from tint_sumo.traits import TraitModel
 
@@ -29,18 +31,33 @@ class Contender:
 
     name: str
     policy: Policy
-    source: Callable[[], TraitSource] | None = None  # where the traits in its observations come from; None: no traits
-    p_conservative: Share = DEFAULT_P_CONSERVATIVE  # what it was trained for
+    source: Callable[[], TraitSource] | None = None  # source of the traits in its observations; None: it has no traits
+    p_conservative: Share | None = DEFAULT_P_CONSERVATIVE  # what it was trained for; None in a SUMO configuration
     action_repeat: int = 1  # simulation steps per decision
-    scene: str = T_INTERSECTION  # what it was trained in
+    scene: AnyScene = T_INTERSECTION  # what it was trained in
+
+    @property
+    def scene_name(self) -> str:
+        return self.scene if isinstance(self.scene, str) else self.scene.name
+
+    @property
+    def tau_s(self) -> float | None:
+        """Time headway of the scene's drivers; None in a SUMO configuration."""
+        scene = find_scene(self.scene)
+        return None if isinstance(scene, OwnScene) else scene.population.idm.tau_s
 
     def make_venv(self, num_envs: int, **task: Any) -> VecEnv:
-        """Environments with the observations the policy takes; ``task`` as in ``SceneEnv``."""
+        """Environments with the observations the policy takes; ``task`` as in ``SceneEnv``.
+
+        In a SUMO configuration each has a process of its own, and there are no more than the machine has cores.
+        """
         source = None if self.source is None else self.source()
-        return policy_venv(num_envs, source, action_repeat=self.action_repeat, **{"scene": self.scene, **task})
+        place = task.get("scene", self.scene)
+        count = min(num_envs, os.cpu_count() or 1) if isinstance(place, OwnScene) else num_envs
+        return policy_venv(count, source, action_repeat=self.action_repeat, **{"scene": place, **task})
 
 
-def load_policy(name_or_path: str | Path, *, scene: str | None = None, allow_pickle: bool = False) -> Contender:
+def load_policy(name_or_path: str | Path, *, scene: AnyScene | None = None, allow_pickle: bool = False) -> Contender:
     """A hand-written rule or a shipped policy by its name, or a trained one by its folder or file.
 
     The card, a .json file beside the weights, tells the method, and where the trait model is.
@@ -48,7 +65,7 @@ def load_policy(name_or_path: str | Path, *, scene: str | None = None, allow_pic
     Args:
         name_or_path: name, folder of a training run, .safetensors file, or Stable-Baselines3's .zip file with the
             card beside it.
-        scene: name of the scene it shall drive in; if not given the one it was trained in, for rules the paper's.
+        scene: the scene it shall drive in; if not given the one it was trained in, for rules the paper's.
         allow_pickle: read .zip files. They can run any code, so allow that only for files you trust.
 
     Raises:
@@ -56,8 +73,8 @@ def load_policy(name_or_path: str | Path, *, scene: str | None = None, allow_pic
     """
     method = METHODS.get(str(name_or_path))
     if isinstance(method, Rule):
-        place = find_scene(scene or T_INTERSECTION).name
-        return Contender(method.name, method.make(place), scene=place)
+        place = scene or T_INTERSECTION
+        return _in_scene(Contender(method.name, method.make(place)), place)
     if Path(name_or_path).suffix == ".zip":
         stem = Path(name_or_path).with_suffix("")
         found = _contender(stem, _load_zip(Path(name_or_path), allow_pickle))
@@ -68,17 +85,39 @@ def load_policy(name_or_path: str | Path, *, scene: str | None = None, allow_pic
     if scene is None:
         if found.scene == ALL_SCENES:
             raise InputError(f"{name_or_path} was trained in all scenes; say --scene NAME to choose one")
-        _require_same_roads(stem, found.scene)
+        _require_same_roads(stem, found)
         return found
-    return replace(found, scene=find_scene(scene).name)
+    return _in_scene(found, scene)
 
 
-def _require_same_roads(stem: Path, scene: str) -> None:
+def _in_scene(contender: Contender, scene: AnyScene) -> Contender:
+    """The policy in another scene.
+
+    Raises:
+        InputError: there is no such scene, or it has other numbers of observed vehicles or of actions.
+    """
+    found = find_scene(scene)
+    network: Any = contender.policy
+    is_rule = contender.source is None
+    vehicles = found.max_vehicles if is_rule else network.observation_space["vehicles"].shape[0]
+    actions = RULE_ACTIONS if is_rule else network.action_space.n
+    for what, wanted, there in (
+        ("max_vehicles", vehicles, found.max_vehicles),
+        ("desired_speeds_mps", actions, len(found.ego.controller.desired_speeds_mps)),
+    ):
+        if wanted != there:
+            raise InputError(f"policy {contender.name} needs {what} of {wanted}, and scene {found.name} has {there}")
+    trained_for = DEFAULT_P_CONSERVATIVE if contender.p_conservative is None else contender.p_conservative
+    return replace(contender, scene=scene, p_conservative=None if isinstance(found, OwnScene) else trained_for)
+
+
+def _require_same_roads(stem: Path, found: Contender) -> None:
     """Raise InputError if a policy was trained in another version of its scene."""
-    if read_policy_card(stem).get("scene_digest") != digest_of(scene):
+    if read_policy_card(stem).get("scene_digest") != find_scene(found.scene).digest:
+        say = f"say --scene {found.scene}" if isinstance(found.scene, str) else "give the scene in a --config file"
         raise InputError(
-            f"{card_file(stem)}: this policy was trained in another version of the scene {scene}; "
-            f"say --scene {scene} to use it all the same"
+            f"{card_file(stem)}: this policy was trained in another version of the scene {found.scene_name}; "
+            f"{say} to use it all the same"
         )
 
 
@@ -100,9 +139,9 @@ def _contender(stem: Path, policy: Any) -> Contender:
         stem.name,
         policy,
         lambda: learned.make_source(encoder),
-        ends(card["p_conservative"]),
+        None if card["p_conservative"] is None else ends(card["p_conservative"]),
         int(card["settings"]["action_repeat"]),
-        card["scene"],
+        read_described(card),
     )
 
 
@@ -147,9 +186,10 @@ def _checked_card(stem: Path) -> dict[str, Any]:
     refuse_old_name(card.get("method"))
     method = METHODS.get(str(card.get("method")))
     settings = card.get("settings")
-    fits = isinstance(method, Learned) and is_share(card.get("p_conservative"))
+    share = card.get("p_conservative")
+    fits = isinstance(method, Learned) and (is_share(share) or (share is None and "scene_settings" in card))
     fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
-    fits &= str(card.get("scene")) in (*SCENES, ALL_SCENES)
+    fits &= "scene_settings" in card or str(card.get("scene")) in (*SCENES, ALL_SCENES)
     if not fits or (isinstance(method, Learned) and method.encoder and not _is_file_name(card.get("traits"))):
         raise InputError(f"{card_file(stem)} is not the card of a policy; restore the file or train the policy again")
     return card

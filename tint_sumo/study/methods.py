@@ -16,6 +16,7 @@ from tint_sumo.policy.trait_sources import (
     StreamingTraits,
     TraitSource,
 )
+from tint_sumo.scenes import AnyScene
 from tint_sumo.study.rules import AlwaysGo, TimeToCollision
 from tint_sumo.traits import TraitModel
 
@@ -38,8 +39,8 @@ class Rule:
     """A hand-written policy."""
 
     name: str
-    title: str  # in tables and figures
-    make: Callable[[str], Policy]  # takes the name of a scene
+    title: str  # name in tables and figures
+    make: Callable[[AnyScene], Policy]
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,13 @@ class Learned:
     source: Callable[..., TraitSource]  # takes the trait model if there is one
     encoder: str | None = None  # trait method (``tint_sumo.traits.TRAIT_METHODS``) whose model it needs
     attention: bool = True
-    critic_sees_true_traits: bool = False  # in training; the policy itself never does
+    critic_sees_true_traits: bool = False  # only in training; the policy itself never sees them
     trained_as: str | None = None  # the method whose training it shares, if it drives with other traits than it learnt
+
+    @property
+    def sees_true_traits(self) -> bool:
+        """Whether its training does."""
+        return self.source is OracleTraits or self.critic_sees_true_traits or self.trained_as is not None
 
     def make_source(self, encoder: TraitModel | None) -> TraitSource:
         """A new source of traits."""

@@ -1,18 +1,19 @@
 """The study's jobs of training policies and of testing them."""
 
-import time
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 import torch
 
-from tint_sumo.config import PpoSettings, Share, ends
+from tint_sumo.config import PpoSettings, Share, ends, share_words
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_json
-from tint_sumo.progress import Report
+from tint_sumo.progress import Report, part_of
+from tint_sumo.scenes import T_INTERSECTION, AnyScene
+from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Conditions, Trials
 from tint_sumo.study.evaluation import Evaluation, evaluate
 from tint_sumo.study.loading import load_policy
@@ -22,6 +23,7 @@ from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Measured, Result
 from tint_sumo.study.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
 
 CASES = 0  # the set of cases that all policies are tested on
+_SMOOTHED = 5  # points of a learning curve
 
 
 @dataclass(frozen=True)
@@ -34,10 +36,15 @@ class TrainJob:
     settings: PpoSettings
     shipped_traits: bool  # rather than a trait model of the study
     out: Path  # of the study
+    scene: AnyScene = T_INTERSECTION
 
     @property
     def name(self) -> str:
         return f"train {label(self.method, self.mix, self.seed)}"
+
+    @property
+    def title(self) -> Title:
+        return Title("train", self.method, share_words(self.mix), self.seed)
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -58,7 +65,6 @@ class TrainJob:
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        began = time.monotonic()
         method = find_learned(self.method)
         traits = None if self.shipped_traits else self.out / "traits" / str(method.encoder) / "model.safetensors"
         if method.trained_as is not None:
@@ -71,10 +77,11 @@ class TrainJob:
             self.seed,
             self.folder,
             settings=self.settings,
+            scene=self.scene,
             traits=traits,
             report=report,
         )
-        return f"trained ({time.monotonic() - began:.0f} s)"
+        return ""
 
 
 @dataclass(frozen=True)
@@ -86,10 +93,17 @@ class EvaluateJob:
     seed: int
     trials: tuple[Trials, ...]
     out: Path  # of the study
+    scene: AnyScene = T_INTERSECTION
 
     @property
     def name(self) -> str:
         return f"evaluate {self._label}"
+
+    @property
+    def title(self) -> Title:
+        if self.mix is None:
+            return Title("evaluate", self._label)
+        return Title("evaluate", self.method, share_words(self.mix), self.seed)
 
     @property
     def _label(self) -> str:
@@ -108,18 +122,17 @@ class EvaluateJob:
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        began = time.monotonic()
         wanted = [(one, trials.episodes) for trials in self.trials for one in trials.conditions if self._meets(one)]
         total, done = sum(episodes for _, episodes in wanted), 0
         tested: list[Measured] = []
         for conditions, episodes in wanted:
-            evaluation = self._test(conditions, episodes, partial(_shifted, report, done, total))
+            evaluation = self._test(conditions, episodes, part_of(report, done, total))
             tested.append(Measured(conditions, evaluation))
             done += episodes
         origin = GIVEN if self.mix is None else TRAINED
         write_json(self.result_file, Result(self.method, origin, self.mix, self.seed, tuple(tested)).to_json())
         successes = ", ".join(f"{one.evaluation.rate('success').value:.1%}" for one in tested)
-        return f"success {successes} ({time.monotonic() - began:.0f} s)"
+        return f"success {successes}"
 
     def _meets(self, conditions: Conditions) -> bool:
         """Whether the policy is tested there: among drivers it was trained for, and if it was trained at all."""
@@ -130,20 +143,15 @@ class EvaluateJob:
         return low <= tested_low and tested_high <= high
 
     def _test(self, conditions: Conditions, episodes: int, report: Report) -> Evaluation:
-        if self.mix is None:
-            contender = load_policy(self.method)
-        else:
-            folder = self.out / "policies" / self._label
-            contender = load_policy(snapshot_stem(folder, conditions.percent).with_suffix(".safetensors"))
-        world = {key: value for key, value in asdict(conditions).items() if key != "percent"}
+        path = policy_path(self.out, self.method, self.mix, self.seed, conditions.percent)
+        contender = load_policy(path, scene=self.scene if self.mix is None else None)
         return evaluate(
-            contender.policy, lambda num_envs: contender.make_venv(num_envs, **world), episodes, CASES, report=report
+            contender.policy,
+            lambda num_envs: contender.make_venv(num_envs, **conditions.world),
+            episodes,
+            CASES,
+            report=report,
         )
-
-
-def _shifted(report: Report, before: int, total: int, done: int, _: int, note: str) -> None:
-    """Report cases under some conditions among those under all."""
-    report(before + done, total, note)
 
 
 def label(method: str, mix: Share | None, seed: int) -> str:
@@ -152,6 +160,13 @@ def label(method: str, mix: Share | None, seed: int) -> str:
         return method if isinstance(find_method(method), Rule) else f"{method}-shipped"
     low, high = ends(mix)
     return f"{method}-P{low:g}-seed{seed}" if low == high else f"{method}-P{low:g}to{high:g}-seed{seed}"
+
+
+def policy_path(out: Path, method: str, mix: Share | None, seed: int, percent: int = 100) -> str | Path:
+    """Where a policy of the study in ``out`` is after some percent of its training; the name of one that was given."""
+    if mix is None:
+        return method
+    return snapshot_stem(out / "policies" / label(method, mix, seed), percent).with_suffix(".safetensors")
 
 
 def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
@@ -165,6 +180,12 @@ def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
     files = {name: sorted((out / "policies").glob(f"{name}-P*/{CURVE_FILE}")) for name in METHODS}
     found = {name: [curve for curve in map(_read_curve, own) if len(curve)] for name, own in files.items()}
     return {name: curves for name, curves in found.items() if curves}
+
+
+def smoothed_percent(seeds: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Success in training, %: a row for each number of decisions, a column for each seed."""
+    shares = [one.set_index("decisions")["success"].rolling(_SMOOTHED, min_periods=1).mean() for one in seeds]
+    return 100.0 * pd.concat(shares, axis=1).dropna()
 
 
 def _read_curve(file: Path) -> pd.DataFrame:

@@ -1,21 +1,22 @@
 """Jobs in worker processes that end cleanly: with Ctrl-C, with an error, or with the main process."""
 
 import signal
-import sys
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from types import FrameType
-from typing import Any, NoReturn, Protocol
-
-from tqdm import tqdm
+from typing import NoReturn, Protocol
 
 from tint_sumo.errors import InputError
+from tint_sumo.job_table import job_table
 from tint_sumo.processes import answer, start_worker, told
-from tint_sumo.progress import Report, make_bar
+from tint_sumo.progress import Progress, Report
+from tint_sumo.standings import Title
 
 REFRESH_S = 1.0
+REPORT_INTERVAL_S = 0.2  # at most so often a job tells where it stands
 THREADS_PER_JOB = 1  # of torch: the jobs share the cores among them
 INTERRUPT_S = 30.0  # more than enough to save a checkpoint
 
@@ -27,13 +28,17 @@ class Job(Protocol):
     def name(self) -> str: ...
 
     @property
+    def title(self) -> Title:
+        """How it is shown."""
+
+    @property
     def needs(self) -> tuple[str, ...]:
         """Names of the jobs that must be done before."""
 
     def is_done(self) -> bool: ...
 
     def run(self, report: Report) -> str:
-        """Do the work and say in a line what came out."""
+        """Do the work and say in a few words what came out; nothing if the last report says it."""
 
 
 def run_jobs(jobs: Sequence[Job], workers: int, progress: bool = True) -> None:
@@ -44,27 +49,23 @@ def run_jobs(jobs: Sequence[Job], workers: int, progress: bool = True) -> None:
     """
     waiting = [job for job in jobs if not job.is_done()]
     running: list[_Worker] = []
-    free = list(range(1, workers + 1))  # lines of the terminal below the global bar
-    with _global_bar(len(jobs), len(waiting), progress) as bar:
+    with job_table([job.title for job in waiting], len(jobs) - len(waiting), progress=progress) as table:
         try:
             while waiting or running:
                 open_names = {job.name for job in waiting} | {worker.job.name for worker in running}
                 ready = [job for job in waiting if not open_names.intersection(job.needs)]
-                for job, line in zip(ready, tuple(free), strict=False):
+                for job in ready[: workers - len(running)]:
                     waiting.remove(job)
-                    free.remove(line)
-                    running.append(_Worker(job, line, progress))
+                    running.append(_Worker(job))
+                    table.begin(job.title)
                 for worker in _heard_from(running):
-                    outcome = worker.listen()
-                    if outcome is not None:
+                    news = worker.listen()
+                    if isinstance(news, Progress):
+                        table.report(worker.job.title, news)
+                    else:
                         running.remove(worker)
-                        free.append(worker.line)
-                        free.sort()
-                        if progress:
-                            tqdm.write(f"{worker.job.name}: {outcome}", file=sys.stderr)
-                        bar.update()
-                if sys.stderr.isatty():
-                    bar.refresh()
+                        table.end(worker.job.title, news)
+                table.refresh()
         finally:
             for worker in running:
                 worker.interrupt()
@@ -72,31 +73,21 @@ def run_jobs(jobs: Sequence[Job], workers: int, progress: bool = True) -> None:
                 worker.join()
 
 
-def _global_bar(jobs: int, waiting: int, progress: bool) -> "tqdm[NoReturn]":
-    return make_bar(desc="study", total=jobs, initial=jobs - waiting, unit="job", disable=not progress)
-
-
 def _heard_from(running: "Sequence[_Worker]") -> "list[_Worker]":
-    """Workers with news; waits a moment for some, and keeps the bars' clocks going."""
+    """Workers with news; waits a moment for some."""
     heard = connection.wait([worker.pipe for worker in running], REFRESH_S)
-    for worker in running:
-        worker.bar.refresh()
     return [worker for worker in running if worker.pipe in heard]
 
 
 class _Worker:
-    """A process that does one job, and its progress bar."""
+    """A process that does one job."""
 
-    def __init__(self, job: Job, line: int, progress: bool) -> None:
+    def __init__(self, job: Job) -> None:
         self.job = job
-        self.line = line
-        # Where bars cannot be redrawn in place, as in a log file, the global one is enough.
-        hidden = not (progress and sys.stderr.isatty())
-        self.bar: tqdm[NoReturn] = make_bar(desc=job.name, total=1, position=line, leave=False, disable=hidden)
         self.pipe, self._process = start_worker(_work, job)
 
-    def listen(self) -> str | None:
-        """Take one message; the job's closing line if it was the last.
+    def listen(self) -> Progress | str:
+        """Take one message: where the job stands or, if it was the last, the job's closing line.
 
         Raises:
             InputError, RuntimeError: the job failed.
@@ -106,10 +97,8 @@ class _Worker:
         except EOFError:
             kind, content = "died", None
         if kind == "progress":
-            self.bar.n, self.bar.total, note = content
-            self.bar.set_postfix_str(note, refresh=False)
-            return None
-        self.bar.close()
+            assert isinstance(content, Progress)
+            return content
         self._process.join()
         if kind == "died":
             raise RuntimeError(f"{self.job.name} ended with exit code {self._process.exitcode}")
@@ -119,7 +108,6 @@ class _Worker:
 
     def interrupt(self) -> None:
         """Tell the process to save its work and end."""
-        self.bar.close()
         self._process.terminate()
 
     def join(self) -> None:
@@ -132,8 +120,13 @@ def _work(pipe: Connection, job: Job) -> None:
     """The worker process."""
     signal.signal(signal.SIGTERM, _raise_interrupt)
 
-    def report(*content: Any) -> None:
-        pipe.send(("progress", content))
+    sent_s = -REPORT_INTERVAL_S
+
+    def report(progress: Progress) -> None:
+        nonlocal sent_s
+        if progress.done == progress.total or time.monotonic() - sent_s >= REPORT_INTERVAL_S:
+            sent_s = time.monotonic()
+            pipe.send(("progress", progress))
 
     with suppress(KeyboardInterrupt):
         pipe.send(told(lambda: job.run(report)))

@@ -17,7 +17,7 @@ from tint_sumo.study.policy_jobs import read_curves
 from tint_sumo.study.results import read_results
 from tint_sumo.study.rows import Row, at_mixes, over_all_mixes, tabulate
 from tint_sumo.study.statistics import difference_interval
-from tint_sumo.study.tables import markdown_table
+from tint_sumo.study.tables import Lines, Table
 
 Ceilings = Mapping[float, float]  # share of the cases that a careful driver can finish, by P(conservative)
 
@@ -27,10 +27,12 @@ class StudyReport:
     """What was written, and the tables themselves."""
 
     rows: tuple[Row, ...]
+    tables: tuple[Table, ...]
     markdown: str
     csv_file: Path
     markdown_file: Path
     figure_files: tuple[Path, ...]
+    page_file: Path | None = None  # until the page is written
 
 
 def write_report(out: Path) -> StudyReport:
@@ -47,8 +49,9 @@ def write_report(out: Path) -> StudyReport:
         figures.append(plot_worlds(over_all_mixes(rows), out / "worlds.png"))
     if curves := read_curves(out):
         figures.append(plot_curves(curves, out / "curves.png"))
-    markdown = to_markdown(rows, ceilings)
-    report = StudyReport(tuple(rows), markdown, out / "results.csv", out / "results.md", tuple(figures))
+    tables = result_tables(rows, ceilings)
+    markdown = to_markdown(tables)
+    report = StudyReport(tuple(rows), tuple(tables), markdown, out / "results.csv", out / "results.md", tuple(figures))
     write_text(report.csv_file, to_csv(rows, ceilings))
     write_text(report.markdown_file, markdown)
     return report
@@ -84,19 +87,23 @@ def to_csv(rows: Sequence[Row], ceilings: Ceilings) -> str:
     return text.getvalue()
 
 
-def to_markdown(rows: Sequence[Row], ceilings: Ceilings) -> str:
+def to_markdown(tables: Sequence[Table]) -> str:
+    return "\n\n".join(part for table in tables for part in table.markdown) + "\n"
+
+
+def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
     """All tables for readers."""
     main, worlds = at_mixes(rows), over_all_mixes(rows)
-    parts = []
+    tables = []
     if main:
-        parts += ["## Success by mix of drivers", _success_table(main, ceilings), _SUCCESS_NOTE]
-        parts += ["## All outcomes", _outcome_table(main), _OUTCOME_NOTE]
-        parts += ["## Who is hit", _collision_table(main), _COLLISION_NOTE]
+        tables.append(Table("Success by mix of drivers", _success_lines(main, ceilings), _SUCCESS_NOTE))
+        tables.append(Table("All outcomes", _outcome_lines(main), _OUTCOME_NOTE))
+        tables.append(Table("Who is hit", _collision_lines(main), _COLLISION_NOTE))
     if _compared(main):
-        parts += ["## Differences in success", _difference_table(main), _DIFFERENCE_NOTE]
+        tables.append(Table("Differences in success", _difference_lines(main), _DIFFERENCE_NOTE))
     if worlds:
-        parts += ["## Other worlds and shorter trainings", _worlds_table(worlds), _WORLDS_NOTE]
-    return "\n\n".join(parts) + "\n"
+        tables.append(Table("Other worlds and shorter trainings", _world_lines(worlds), _WORLDS_NOTE))
+    return tables
 
 
 _SUCCESS_NOTE = (
@@ -120,7 +127,7 @@ _WORLDS_NOTE = (
 )
 
 
-def _success_table(rows: Sequence[Row], ceilings: Ceilings) -> str:
+def _success_lines(rows: Sequence[Row], ceilings: Ceilings) -> Lines:
     mixes = sorted({_number(row) for row in rows})
     lines = [["method", "seeds", *(f"P {p:g}" for p in mixes)]]
     kinds = dict.fromkeys((row.method, row.origin, row.title, row.mix) for row in _by_method(rows))
@@ -133,10 +140,10 @@ def _success_table(rows: Sequence[Row], ceilings: Ceilings) -> str:
     paper = {_number(row): row.published["success"] for row in rows if row.method == "vae" and row.published}
     if paper:
         lines.append(["paper", "", *(f"{paper[p]:g}" if p in paper else "-" for p in mixes)])
-    return markdown_table(lines)
+    return lines
 
 
-def _outcome_table(rows: Sequence[Row]) -> str:
+def _outcome_lines(rows: Sequence[Row]) -> Lines:
     lines = [["P", "method", *(f"{outcome} %" for outcome in OUTCOMES), "time s", "cases", "seeds", "paper %"]]
     for row in rows:
         time_s = row.navigation_time_s
@@ -151,10 +158,10 @@ def _outcome_table(rows: Sequence[Row]) -> str:
                 " / ".join(f"{rate:g}" for rate in row.published.values()) or "-",
             ]
         )
-    return markdown_table(lines)
+    return lines
 
 
-def _collision_table(rows: Sequence[Row]) -> str:
+def _collision_lines(rows: Sequence[Row]) -> Lines:
     kinds = sorted({kind for row in rows for kind in row.collisions})
     lines = [["method", *kinds]]
     for title in dict.fromkeys(row.title for row in _by_method(rows)):
@@ -162,7 +169,7 @@ def _collision_table(rows: Sequence[Row]) -> str:
         cases = sum(row.episodes * len(row.seeds) for row in own)
         counts = [sum(row.collisions.get(kind, 0) for row in own) for kind in kinds]
         lines.append([title, *(f"{1000 * count / cases:.1f}" for count in counts)])
-    return markdown_table(lines)
+    return lines
 
 
 def _compared(rows: Sequence[Row]) -> list[Row]:
@@ -170,7 +177,7 @@ def _compared(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if len(row.seeds) > 1]
 
 
-def _difference_table(rows: Sequence[Row]) -> str:
+def _difference_lines(rows: Sequence[Row]) -> Lines:
     trained = _compared(rows)
     mixes = sorted({_number(row) for row in trained})
     lines = [["method", "less", *(f"P {p:g}" for p in mixes)]]
@@ -181,7 +188,7 @@ def _difference_table(rows: Sequence[Row]) -> str:
             if references and own:
                 cells = [_difference(own.get(p), references.get(p)) for p in mixes]
                 lines.append([next(iter(own.values())).title, next(iter(references.values())).title, *cells])
-    return markdown_table(lines)
+    return lines
 
 
 def _difference(row: Row | None, other: Row | None) -> str:
@@ -191,7 +198,7 @@ def _difference(row: Row | None, other: Row | None) -> str:
     return f"{100 * (row.rate('success') - other.rate('success')):+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
 
 
-def _worlds_table(rows: Sequence[Row]) -> str:
+def _world_lines(rows: Sequence[Row]) -> Lines:
     worlds = list(dict.fromkeys(row.conditions for row in rows))
     lines = [["method", *(one.label for one in worlds)]]
     for title in dict.fromkeys(row.title for row in _by_method(rows)):
@@ -201,7 +208,7 @@ def _worlds_table(rows: Sequence[Row]) -> str:
             for one in worlds
         ]
         lines.append([title, *cells])
-    return markdown_table(lines)
+    return lines
 
 
 def _by_method(rows: Sequence[Row]) -> list[Row]:

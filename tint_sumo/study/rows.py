@@ -1,7 +1,7 @@
 """The rows of the results: all seeds of a method under the same conditions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from typing import Any
@@ -17,6 +17,12 @@ from tint_sumo.study.published import RATES_PERCENT
 from tint_sumo.study.results import GIVEN, Result
 from tint_sumo.study.statistics import Hits, Interval, rate_interval
 
+WORLDS = {  # what can differ from the world of the training
+    "position_noise_m": "noise on positions (m)",
+    "tau_s": "headway tau of the drivers (s)",
+    "percent": "part of the training (%)",
+}
+
 
 @dataclass(frozen=True)
 class Row:
@@ -30,10 +36,15 @@ class Row:
     evaluations: tuple[Evaluation, ...]  # of each seed
 
     @property
+    def is_shipped(self) -> bool:
+        """Whether the package came with the policy."""
+        return self.origin == GIVEN and isinstance(METHODS.get(self.method), Learned)
+
+    @property
     def title(self) -> str:
         method = METHODS.get(self.method)
         title = self.method if method is None else method.title
-        return f"{title} (shipped)" if self.origin == GIVEN and isinstance(method, Learned) else title
+        return f"{title} (shipped)" if self.is_shipped else title
 
     @property
     def episodes(self) -> int:
@@ -138,3 +149,19 @@ def at_mixes(rows: Sequence[Row]) -> list[Row]:
 def over_all_mixes(rows: Sequence[Row]) -> list[Row]:
     """The rows of other worlds and parts of the training, where every case has a mix of its own."""
     return [row for row in rows if isinstance(row.conditions.p_conservative, tuple)]
+
+
+def by_title(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """The rows of each method, shipped policies apart, in the registry's order."""
+    order = {name: position for position, name in enumerate(METHODS)}
+    found: dict[str, list[Row]] = {}
+    for row in sorted(rows, key=lambda row: (order.get(row.method, len(order)), row.origin != GIVEN)):
+        found.setdefault(row.title, []).append(row)
+    return found
+
+
+def varied(rows: Sequence[Row], name: str) -> dict[float, Row]:
+    """The rows that differ from the world of the training in at most one condition, by its values in their order."""
+    base = Conditions(rows[0].conditions.p_conservative)
+    shown = [row for row in rows if replace(row.conditions, **{name: getattr(base, name)}) == base]
+    return dict(sorted(((getattr(row.conditions, name), row) for row in shown), key=lambda pair: pair[0]))

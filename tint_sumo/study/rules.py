@@ -6,15 +6,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.config import POSITION_SCALE_M, SPEED_SCALE_MPS, STEP_S
-from tint_sumo.scenes import T_INTERSECTION, find_scene
+from tint_sumo.config import POSITION_SCALE_M, SPEED_SCALE_MPS
+from tint_sumo.errors import InputError
+from tint_sumo.scenes import T_INTERSECTION, AnyScene, OwnScene, find_scene
 from tint_sumo.scenes.geometry import POSE, SPACING_M, Floats, along, as_line, place, project
 from tint_sumo.scenes.layout import Layout, layout
 
 Observation = dict[str, NDArray[np.float32]]
 State = tuple[NDArray[np.float64], ...]
 
-STOP, CREEP, GO = 0, 1, 2  # actions: desired speeds of 0, 0.5 and 3 m/s
+STOP, CREEP, GO = 0, 1, 2  # actions: desired speeds of 0, 0.5 and 3 m/s in the built-in scenes
+ACTIONS = 3
 
 
 class AlwaysGo:
@@ -52,11 +54,14 @@ class TimeToCollision:
     threshold_s: float = 1.2
     zone_margin_m: float = 1.0  # the zone begins this far before the ego's path
     line_margin_m: float = 0.5  # the ego waits this far before a route's lane
-    scene: str = T_INTERSECTION
+    scene: AnyScene = T_INTERSECTION
 
     @cached_property
     def _world(self) -> "_World":
-        return _World(layout(find_scene(self.scene)))
+        scene = find_scene(self.scene)
+        if isinstance(scene, OwnScene):
+            raise InputError("ttc needs the conflict zones of a built-in scene; take another policy")
+        return _World(layout(scene))
 
     def predict(
         self,
@@ -75,7 +80,7 @@ class TimeToCollision:
         centre_m = observation["vehicles"] * POSITION_SCALE_M + ego_m[:, None]
         present = observation["mask"] > 0.5
         route, along_m = world.on_routes(centre_m)
-        speed_mps = speeds_mps(along_m, present, state, episode_start)
+        speed_mps = speeds_mps(along_m, present, state, episode_start, world.step_s)
         blocking = present & (self.times_s(route, along_m, speed_mps) <= self.threshold_s)
 
         front_m = world.ego_front_m(ego_m)[:, None]
@@ -103,6 +108,7 @@ class _World:
     def __init__(self, layout: Layout) -> None:
         zones, way = layout.zones, layout.ego.way
         self.half_length_m = layout.scene.vehicle.length_m / 2
+        self.step_s = layout.scene.step_s
         self.order = np.argsort(zones.enter_m)
         self.enter_m, self.inside_m = zones.enter_m[self.order], zones.inside_m[self.order]
         self._lines = [as_line(path.way) for path in layout.routes]
@@ -132,7 +138,11 @@ class _World:
 
 
 def speeds_mps(
-    along_m: Floats, present: NDArray[np.bool_], state: State | None, episode_start: NDArray[np.bool_] | None
+    along_m: Floats,
+    present: NDArray[np.bool_],
+    state: State | None,
+    episode_start: NDArray[np.bool_] | None,
+    step_s: float,
 ) -> Floats:
     """Speeds along the routes, (N, V); the ego's top speed for vehicles not seen at the step before."""
     if state is None:
@@ -141,4 +151,4 @@ def speeds_mps(
     seen = present & (was_present > 0.5)
     if episode_start is not None:
         seen &= ~episode_start[:, None]
-    return np.where(seen, (along_m - was_along_m) / STEP_S, SPEED_SCALE_MPS)
+    return np.where(seen, (along_m - was_along_m) / step_s, SPEED_SCALE_MPS)

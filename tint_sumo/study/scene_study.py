@@ -17,6 +17,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, read_json, write_json, write_text
 from tint_sumo.progress import Report
 from tint_sumo.scenes import SCENES, T_INTERSECTION
+from tint_sumo.standings import Title
 from tint_sumo.study.budgets import TRAIT_BUDGETS
 from tint_sumo.study.pool import THREADS_PER_JOB, Job, run_jobs
 from tint_sumo.study.tables import markdown_table
@@ -39,6 +40,9 @@ class SceneStudy:
     noise_m: float = 0.0
     scenes: tuple[str, ...] = tuple(SCENES)
     recording_seed: int = 77  # of the first scene; unlike that of any dataset a shipped model was trained on
+
+
+SCENE_STUDIES = {"full": SceneStudy()}
 
 
 def run_scene_study(study: SceneStudy, out: Path, *, workers: int = 2, progress: bool = True) -> pd.DataFrame:
@@ -104,6 +108,10 @@ class TransferJob:
         return f"{self.method}-{self._choice}-seed{self.seed}"
 
     @property
+    def title(self) -> Title:
+        return Title(f"traits from {self._choice}", self.method, seed=self.seed)
+
+    @property
     def _choice(self) -> str:
         return self.trained_on[0] if len(self.trained_on) == 1 else "all"
 
@@ -117,12 +125,10 @@ class TransferJob:
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
         scenes = self.study.scenes
-        report(0, len(scenes) + 1, "training")
-        model, probe = self._train()
+        model, probe = self._train(report)
         line = fit_line(model, *self._properties(self.trained_on, test=False))
         rows = []
-        for done, scene in enumerate(scenes):
-            report(done + 1, len(scenes) + 1, scene)
+        for scene in scenes:
             accuracy = probe.score(*self._labelled((scene,), test=True)).accuracy
             speed_r2 = float(line(*self._properties((scene,), test=True)))
             rows.append({"scene": scene, "accuracy": accuracy, "speed_r2": speed_r2})
@@ -132,7 +138,7 @@ class TransferJob:
         )
         return ", ".join(f"{row['scene']} {row['accuracy']:.2%}" for row in rows)
 
-    def _train(self) -> tuple[traits.TraitModel, Probe]:
+    def _train(self, report: Report) -> tuple[traits.TraitModel, Probe]:
         windows, labels = self._labelled(self.trained_on, test=False)
         model = train(
             windows,
@@ -141,7 +147,7 @@ class TransferJob:
             method=self.method,
             seed=self.seed,
             conservative=labels == CONSERVATIVE_LABEL if find_trait_method(self.method).uses_labels else None,
-            progress=False,
+            report=report,
             card={"data": {"scenes": list(self.trained_on), "windows": len(windows)}},
         )
         return model, Probe(model, windows, labels, noise_m=self.study.noise_m, seed=self.seed)

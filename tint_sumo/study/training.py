@@ -3,12 +3,10 @@
 import csv
 import hashlib
 import io
-import platform
 import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +25,10 @@ from tint_sumo.files import claim_folder, whole_file, write_text
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy
 from tint_sumo.policy.venv import policy_venv
-from tint_sumo.progress import Report, silent
-from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, digest_of
+from tint_sumo.progress import Progress, Report, silent
+from tint_sumo.provenance import versions
+from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnScene, described, find_scene
+from tint_sumo.study.budgets import SNAPSHOTS_PERCENT
 from tint_sumo.study.evaluation import CASE_SEED, require_seed
 from tint_sumo.study.methods import Learned, find_learned
 from tint_sumo.traits import TraitModel
@@ -41,7 +41,6 @@ ZIP_FILE = "policy.zip"
 CURVE_FILE = "curve.csv"
 TRAITS = "traits"  # name of the trait model beside a policy
 RECENT_EPISODES = 500
-SNAPSHOTS_PERCENT = (25, 50)  # of the training, after which the policy is kept, too
 
 
 def snapshot_stem(out: Path, percent: int) -> Path:
@@ -51,13 +50,13 @@ def snapshot_stem(out: Path, percent: int) -> Path:
 
 def train_policy(
     method: str,
-    p_conservative: Share,
+    p_conservative: Share | None,
     steps: int,
     seed: int,
     out: Path,
     *,
     settings: PpoSettings,
-    scene: str = T_INTERSECTION,
+    scene: AnyScene = T_INTERSECTION,
     traits: str | Path | None = None,
     other_scene: bool = False,
     with_zip: bool = False,
@@ -71,12 +70,13 @@ def train_policy(
 
     Args:
         method: name of a learned method.
-        p_conservative: share of conservative drivers it trains among; a range: each episode draws its own.
+        p_conservative: share of conservative drivers it trains among; a range: each episode draws its own. None in a
+            SUMO configuration, whose demand tells who drives.
         steps: decisions of the policy, at least; training ends with a whole rollout.
         seed: of weights, actions and environments, 0 to 1000.
         out: a new folder, or the one of this very run.
         settings: network and PPO; its ``total_steps`` is not used.
-        scene: name of the scene it trains in, or ``"all"``.
+        scene: the scene it trains in, or ``"all"``.
         traits: trait model by name or path, for methods that infer traits; the shipped one if not given.
         other_scene: take a trait model that was trained in another scene, too.
         with_zip: write the policy as Stable-Baselines3's policy.zip, too.
@@ -89,27 +89,27 @@ def train_policy(
         InputError: bad values, no such method or trait model, ``out`` holds another run, or its checkpoint is damaged.
     """
     learned = find_learned(method)
-    require_share(p_conservative)
+    _require_drivers(learned, p_conservative, scene)
     require_seed(seed)
     if steps < 1:
         raise InputError(f"steps must be at least 1, not {steps}")
     encoder = _load_encoder(learned, traits)
+    place = described(scene)
     if encoder is not None and not other_scene:
-        require_scene(traits or str(learned.encoder), scene, digest_of(scene), "the policy")
+        require_scene(traits or str(learned.encoder), place["scene"], place["scene_digest"], "the policy")
     settings = replace(settings, policy=replace(settings.policy, attention=learned.attention))
     identity = {
         "kind": "policy",
         "method": method,
-        "p_conservative": list(ends(p_conservative)),
+        "p_conservative": None if p_conservative is None else list(ends(p_conservative)),
         "steps": steps,
         "seed": seed,
-        "scene": scene,
-        "scene_digest": digest_of(scene),
+        **place,
         "settings": asdict(settings),
         "traits": None if encoder is None else digest(encoder),
     }
     stem = snapshot_stem(out, 100)
-    with claim_folder(out, identity):
+    with claim_folder(out, identity, with_versions=False):  # the card has them
         if with_zip and card_file(stem).exists() and not (out / ZIP_FILE).exists():
             raise InputError(f"{out} holds a finished run without {ZIP_FILE}; train into another folder to have one")
         if not card_file(stem).exists():
@@ -150,6 +150,24 @@ def share_training(source: Path, method: str, out: Path, traits: str | Path | No
             save_policy(load_policy_network(stem), snapshot_stem(out, percent), {**read_policy_card(stem), **own})
 
 
+def _require_drivers(learned: Learned, p_conservative: Share | None, scene: AnyScene) -> None:
+    """Raise InputError unless a method can be trained among a scene's drivers, in such a mix."""
+    played = T_INTERSECTION if scene == ALL_SCENES else scene
+    found = find_scene(played)
+    if isinstance(found, OwnScene):
+        kinds = len(found.vtypes)
+        if p_conservative is not None:
+            raise InputError("the demand of a .sumocfg tells who drives how; leave p_conservative out")
+    else:
+        kinds = len(found.population.profiles)
+        require_share(found.traffic.p_conservative if p_conservative is None else p_conservative)
+    if learned.sees_true_traits and kinds != 2:
+        raise InputError(
+            f"method {learned.name} is told which of two kinds of drivers each one is of, and scene {found.name} has "
+            f"{kinds}; choose another method"
+        )
+
+
 def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | None:
     if learned.encoder is None:
         return None
@@ -161,11 +179,12 @@ def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | N
 def training_venv(
     learned: Learned,
     encoder: TraitModel | None,
-    p_conservative: Share,
+    p_conservative: Share | None,
     settings: PpoSettings,
-    scene: str = T_INTERSECTION,
+    scene: AnyScene = T_INTERSECTION,
 ) -> VecEnv:
     """Environments with the traits that the method is trained with."""
+    played = [find_scene(one) for one in (SCENES if scene == ALL_SCENES else [scene])]
     shown = learned if learned.trained_as is None else find_learned(learned.trained_as)
     return policy_venv(
         settings.n_envs,
@@ -175,7 +194,7 @@ def training_venv(
         monitored=True,
         scene=list(SCENES) if scene == ALL_SCENES else scene,
         p_conservative=p_conservative,
-        time_limit_s=settings.time_limit_s,
+        time_limit_s=min(settings.time_limit_s, *(one.time_limit_s for one in played)),
     )
 
 
@@ -197,7 +216,7 @@ def _learn(
         if done:  # loading has set the random streams back to their beginning
             model.set_random_seed(_training_seed(seed, done))
         venv.seed(_training_seed(seed, done))
-        report(done, steps, "")
+        report(Progress(done, steps, "step"))
         watch = _Watch(out, steps, card, report)
         try:
             model.learn(steps - done, callback=watch, reset_num_timesteps=False)
@@ -287,14 +306,14 @@ class _Watch(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        note = ""
+        measures: dict[str, float] = {}
         if self._recent:
             shares = {outcome: self._recent.count(outcome) / len(self._recent) for outcome in OUTCOMES}
             for outcome, share in shares.items():
                 self.logger.record(f"rollout/{outcome}", share)
             self._curve.append([str(self.num_timesteps), *(f"{share:.4f}" for share in shares.values())])
-            note = f"success {shares['success']:.0%}, collision {shares['collision']:.0%}"
-        self._report(min(self.num_timesteps, self._steps), self._steps, note)
+            measures = {outcome: shares[outcome] for outcome in ("success", "collision")}
+        self._report(Progress(min(self.num_timesteps, self._steps), self._steps, "step", measures))
 
     def _on_training_end(self) -> None:
         self._write_curve()
@@ -327,5 +346,5 @@ def _card(identity: Mapping[str, Any], encoder: TraitModel | None) -> dict[str, 
     return {
         **{key: value for key, value in identity.items() if key != "kind"},
         **_traits_entries(encoder),
-        "versions": {name: version(name) for name in packages} | {"python": platform.python_version()},
+        "versions": versions(packages),
     }

@@ -8,6 +8,7 @@ import torch
 from tint_sumo.config import TraitSettings
 from tint_sumo.files import write_json
 from tint_sumo.progress import Report
+from tint_sumo.standings import Title
 from tint_sumo.study.pool import THREADS_PER_JOB
 from tint_sumo.study.trait_models import evaluate_traits, plot_traits, train_traits
 from tint_sumo.traits.storage import add_to_card
@@ -29,6 +30,10 @@ class TraitJob:
         return f"traits {self.method}"
 
     @property
+    def title(self) -> Title:
+        return Title("traits", self.method)
+
+    @property
     def needs(self) -> tuple[str, ...]:
         return ()
 
@@ -41,9 +46,8 @@ class TraitJob:
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        report(0, 1, "training")
         data = self.out / DATASET
-        train_traits(data, self.folder, method=self.method, settings=self.settings, seed=SEED, progress=False)
+        train_traits(data, self.folder, method=self.method, settings=self.settings, seed=SEED, report=report)
         found = evaluate_traits(data, self.folder)
         plot_traits(data, self.folder, self.folder)
         add_to_card(self.folder / "model.safetensors", {"accuracy": found["accuracy"]})

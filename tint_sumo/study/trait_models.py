@@ -12,6 +12,7 @@ from tint_sumo.config import CONSERVATIVE_LABEL, LATENT_SIZE, TraitSettings
 from tint_sumo.dataset.window_file import WindowFile, window_file
 from tint_sumo.dataset.windows import (
     Windows,
+    drivers_of,
     load_labels,
     load_windows,
     own_vtypes,
@@ -20,6 +21,7 @@ from tint_sumo.dataset.windows import (
     split_by_episode,
 )
 from tint_sumo.errors import InputError
+from tint_sumo.progress import Report, silent
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
 from tint_sumo.traits.figures import plot_latents, plot_reconstructions
 from tint_sumo.traits.model import find_trait_method
@@ -36,7 +38,7 @@ def train_traits(
     settings: TraitSettings,
     seed: int = 0,
     streaming: bool = False,
-    progress: bool = True,
+    report: Report = silent,
 ) -> dict[str, Any]:
     """Train a trait model on two thirds of a dataset's episodes (paper IV-B) and return its card.
 
@@ -47,7 +49,7 @@ def train_traits(
         settings: sizes, loss weights and schedule.
         seed: of weights, order and noise, and of the split into training and test episodes.
         streaming: keep the windows in a file beside the model instead of in memory; the model is the same.
-        progress: show a progress bar on stderr.
+        report: told of the progress.
 
     Raises:
         InputError: no such method, no usable dataset, a negative seed, no room for the file, or ``out`` holds another
@@ -58,9 +60,9 @@ def train_traits(
     find_trait_method(method)
     if streaming:
         with window_file(read_training_windows(data, TEST_FRACTION, seed), out) as windows:
-            _train(data, windows, out, method=method, settings=settings, seed=seed, progress=progress)
+            _train(data, windows, out, method=method, settings=settings, seed=seed, report=report)
     else:
-        train_on_split(data, load_windows(data), out, method=method, settings=settings, seed=seed, progress=progress)
+        train_on_split(data, load_windows(data), out, method=method, settings=settings, seed=seed, report=report)
     return read_card(out / "model.safetensors")
 
 
@@ -73,7 +75,7 @@ def train_on_split(
     settings: TraitSettings,
     seed: int,
     latent_size: int = LATENT_SIZE,
-    progress: bool = True,
+    report: Report = silent,
 ) -> traits.TraitModel:
     """``train_traits`` on all ``windows`` of the dataset ``data``, loaded before; the trained model."""
     chosen, _ = split_by_episode(windows, TEST_FRACTION, seed)
@@ -85,7 +87,7 @@ def train_on_split(
         settings=settings,
         seed=seed,
         latent_size=latent_size,
-        progress=progress,
+        report=report,
     )
 
 
@@ -98,7 +100,7 @@ def _train(
     settings: TraitSettings,
     seed: int,
     latent_size: int = LATENT_SIZE,
-    progress: bool,
+    report: Report,
 ) -> traits.TraitModel:
     """Train on all of ``windows``, which are of the dataset ``data``."""
     uses_labels = find_trait_method(method).uses_labels
@@ -110,7 +112,7 @@ def _train(
         seed=seed,
         latent_size=latent_size,
         conservative=_first_of_two(load_labels(data, windows), method) if uses_labels else None,
-        progress=progress,
+        report=report,
         card={"data": describe(data)},
     )
 
@@ -146,9 +148,11 @@ def plot_traits(
         InputError: no usable dataset or model.
     """
     trained, windows, labels, seed = _load_for_test(data, model, noise_m, other_scene)
-    if own_vtypes(read_manifest(data)):
+    manifest = read_manifest(data)
+    if own_vtypes(manifest) or len(drivers_of(manifest).profiles) > 2:
         raise InputError(
-            "the picture is of conservative and aggressive drivers, and these are of vTypes; evaluate instead"
+            "the picture is of conservative and aggressive drivers, and these are of vTypes or other profiles; "
+            "evaluate instead"
         )
     _, unseen = split_by_episode(windows, TEST_FRACTION, seed)
     files = [out / "latent.png"]

@@ -12,7 +12,8 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, write_json
-from tint_sumo.progress import Report
+from tint_sumo.progress import Report, part_of
+from tint_sumo.standings import Title
 from tint_sumo.study.budgets import TRAIT_BUDGETS
 from tint_sumo.study.pool import THREADS_PER_JOB, Job, run_jobs
 from tint_sumo.study.results import RESULTS
@@ -43,6 +44,9 @@ class TraitStudy:
     continuous_latents: tuple[int, ...] = (2, 4)
     continuous_seeds: tuple[int, ...] = (0, 1)
     continuous_epochs: int = 10  # properties without classes take longer to show
+
+
+TRAIT_STUDIES = {"full": TraitStudy()}
 
 
 def run_trait_study(study: TraitStudy, out: Path, *, workers: int = 2, progress: bool = True) -> TraitReport:
@@ -115,6 +119,10 @@ class CompareJob:
         return f"{self.method} seed{self.seed}"
 
     @property
+    def title(self) -> Title:
+        return Title("compare", self.method, seed=self.seed)
+
+    @property
     def needs(self) -> tuple[str, ...]:
         return ()
 
@@ -126,10 +134,12 @@ class CompareJob:
         windows, conservative = _load(self.out / "dataset")
         others = {p: _load(_other_data(self.out, p)) for p in self.study.other_p}
         noises_m = self.study.noises_m
+        train, _ = split_by_episode(windows, TEST_FRACTION, self.seed)
+        seen = self.study.settings.epochs * len(train)  # windows of a training
         for done, noise_m in enumerate(noises_m):
-            report(done, len(noises_m), f"{noise_m:g} m noise")
             if not self._result_file(noise_m).exists():
-                self._compare(noise_m, windows, conservative, others)
+                part = part_of(report, done * seen, len(noises_m) * seen)
+                self._compare(noise_m, windows, conservative, others, part)
         return f"{len(noises_m)} noise levels"
 
     def _compare(
@@ -138,6 +148,7 @@ class CompareJob:
         windows: Windows,
         conservative: np.ndarray,
         others: dict[float, tuple[Windows, np.ndarray]],
+        report: Report,
     ) -> None:
         folder = self.out / "models" / _slug(self.method, noise_m, self.seed)
         train, test = split_by_episode(windows, TEST_FRACTION, self.seed)
@@ -146,7 +157,7 @@ class CompareJob:
         settings = replace(self.study.settings, noise_m=noise_m)
         data = self.out / "dataset"
         model = train_on_split(
-            data, windows, folder, method=self.method, settings=settings, seed=self.seed, progress=False
+            data, windows, folder, method=self.method, settings=settings, seed=self.seed, report=report
         )
         training_s = None if resumes else round(time.perf_counter() - began, 1)
         probe = Probe(model, windows[train], conservative[train], noise_m=noise_m, seed=self.seed)
@@ -184,6 +195,10 @@ class ContinuousJob:
         return f"{self.method} continuous {self.latent_size} latents seed{self.seed}"
 
     @property
+    def title(self) -> Title:
+        return Title(f"continuous, {self.latent_size} latents", self.method, seed=self.seed)
+
+    @property
     def needs(self) -> tuple[str, ...]:
         return ()
 
@@ -196,7 +211,6 @@ class ContinuousJob:
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        report(0, 1, "training")
         data = self.out / "continuous"
         folder = self.out / "models" / self.name.replace(" ", "-")
         windows = load_windows(data)
@@ -208,7 +222,7 @@ class ContinuousJob:
             settings=replace(self.study.settings, epochs=self.study.continuous_epochs),
             seed=self.seed,
             latent_size=self.latent_size,
-            progress=False,
+            report=report,
         )
         properties = load_drivers(data, windows, PROPERTIES).to_numpy(np.float64)
         r2 = dict(zip(PROPERTIES, linear_r2(model, windows, properties, seed=self.seed).tolist(), strict=True))

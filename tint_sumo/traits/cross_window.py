@@ -65,7 +65,7 @@ class CrossWindow(TraitModel):
         return {**terms, "total": terms["prediction"] + KL_WEIGHT * terms["kl"]}
 
     def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
-        """Of the next positions in the other windows, each predicted from the true ones before it."""
+        """Errors of the next positions in the other windows, each predicted from the true ones before it."""
         mean, _ = self.encode(batch.states, batch.length)
         displacement, _, target, valid = self._predict(batch, mean.unsqueeze(0))
         return ((displacement[0] - target)[valid] * self.feature_scale[0]).square()

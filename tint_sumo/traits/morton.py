@@ -47,7 +47,7 @@ class Morton(TraitModel):
         return {"kl": kl, "imitation": imitation, "total": total}
 
     def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
-        """Of the next positions, each predicted from the true ones before it."""
+        """Errors of the next positions, each predicted from the true ones before it."""
         features = self.features(batch.states, batch.length)
         mean, _ = self.encoder(features, batch.length)
         chosen, driven = self._accelerations(features, mean, batch.length)

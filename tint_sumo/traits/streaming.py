@@ -26,7 +26,7 @@ class TrackStream:
     def __init__(self, model: CrossWindow, tracks: int) -> None:
         self._model = model
         self._hidden = torch.zeros(tracks, model.settings.hidden_size)
-        self._window_steps = torch.zeros(tracks, dtype=torch.int64)  # of the present window
+        self._window_steps = torch.zeros(tracks, dtype=torch.int64)  # steps so far in the present window
         self._along_m = torch.zeros(tracks)
         self._complete = torch.zeros(2, tracks, model.latent_size)  # evidence of complete windows, see _evidence
         self.steps = np.zeros(tracks, np.float32)

@@ -5,20 +5,19 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
-from tqdm import tqdm
 
 from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.dataset.window_file import WindowFile
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file
-from tint_sumo.progress import make_bar
+from tint_sumo.progress import Progress, Report, silent
 from tint_sumo.traits.batches import TrainingWindows, WindowBatch
 from tint_sumo.traits.model import TraitModel, find_trait_method
 from tint_sumo.traits.storage import RUN_MODEL, load, save
@@ -38,7 +37,7 @@ def train(
     seed: int = 0,
     latent_size: int = LATENT_SIZE,
     conservative: NDArray[np.bool_] | None = None,
-    progress: bool = True,
+    report: Report = silent,
     card: Mapping[str, Any] | None = None,
 ) -> TraitModel:
     """Train ``method`` on all of ``windows`` and write model.safetensors and model.json into ``out``.
@@ -54,7 +53,7 @@ def train(
         seed: of the initial weights, the order of windows and all noise.
         latent_size: numbers that represent a trait.
         conservative: (N,) the true traits, for a method that is trained with them; no other method may have them.
-        progress: show a progress bar on stderr.
+        report: told of the progress.
         card: what else the model's card shall say, such as where the windows come from.
 
     Returns:
@@ -86,7 +85,7 @@ def train(
         labels = None if conservative is None else torch.from_numpy(conservative)
         data = TrainingWindows(windows, labels, with_other=model_type.uses_other_window)
         run = _Run(model, data, settings, seed)
-        loss = run.fit(out / CHECKPOINT_FILE, progress)
+        loss = run.fit(out / CHECKPOINT_FILE, report)
 
         known = {key: identity[key] for key in ("seed", "windows", "windows_sha256")}
         save(model, out / RUN_MODEL, {**known, "loss": loss, **(card or {})})
@@ -106,7 +105,7 @@ class _Run:
             model.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
         )
 
-    def fit(self, checkpoint: Path, progress: bool) -> dict[str, float]:
+    def fit(self, checkpoint: Path, report: Report) -> dict[str, float]:
         """Run all epochs, beginning after those in ``checkpoint``; the mean loss terms of the last epoch.
 
         Each epoch draws from a generator of its own, so a checkpoint needs no generator states.
@@ -115,27 +114,21 @@ class _Run:
         self.model.fit_features(part.with_noise(self.settings.noise_m, generator) for part in self.data.parts())
         done, loss = self._resume(checkpoint)
         saved_at = time.monotonic()
-        with self._bar(done, progress) as bar:
-            for epoch in range(done, self.settings.epochs):
-                loss = self._run_epoch(epoch, bar)
-                bar.set_postfix({name: f"{value:.4g}" for name, value in loss.items()})
-                if time.monotonic() - saved_at >= CHECKPOINT_INTERVAL_S:
-                    self._write_checkpoint(checkpoint, epoch + 1, loss)
-                    saved_at = time.monotonic()
+        report(self._progress(done, 0, loss))
+        for epoch in range(done, self.settings.epochs):
+            loss = self._run_epoch(epoch, report)
+            if time.monotonic() - saved_at >= CHECKPOINT_INTERVAL_S:
+                self._write_checkpoint(checkpoint, epoch + 1, loss)
+                saved_at = time.monotonic()
         return loss
 
-    def _bar(self, done: int, progress: bool) -> "tqdm[NoReturn]":
-        windows = len(self.data)
-        return make_bar(
-            desc=f"traits {self.model.method}",
-            total=self.settings.epochs * windows,
-            initial=done * windows,
-            unit="window",
-            unit_scale=True,
-            disable=not progress,
-        )
+    def _progress(self, epoch: int, windows: int, loss: Mapping[str, float]) -> Progress:
+        """After some windows of an epoch, of which that is the loss."""
+        every = len(self.data)
+        measures = {"loss": loss["total"]} if loss else {}
+        return Progress(epoch * every + windows, self.settings.epochs * every, "window", measures)
 
-    def _run_epoch(self, epoch: int, bar: "tqdm[NoReturn]") -> dict[str, float]:
+    def _run_epoch(self, epoch: int, report: Report) -> dict[str, float]:
         """One pass over the shuffled windows; the mean of each loss term over the batches."""
         generator = self._generator(1 + epoch)
         order = torch.randperm(len(self.data), generator=generator)
@@ -147,8 +140,9 @@ class _Run:
             terms = self._step(batch, 1.0 - (epoch + number / len(starts)) / self.settings.epochs, generator)
             for name, value in terms.items():
                 sums[name] = sums.get(name, 0.0) + value
-            bar.update(len(index))
-        return {name: value / len(starts) for name, value in sums.items()}
+            means = {name: value / (number + 1) for name, value in sums.items()}
+            report(self._progress(epoch, start + len(index), means))
+        return means
 
     def _step(self, batch: WindowBatch, remaining: float, generator: torch.Generator) -> dict[str, float]:
         """One gradient step at the fraction ``remaining`` of the learning rate; the loss terms."""

@@ -65,7 +65,7 @@ class Vae(TraitModel):
         return {**terms, "total": total}
 
     def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
-        """Of the reconstructed offsets, from the second step on."""
+        """Errors of the reconstructed offsets, from the second step on."""
         offset = self.reconstruct(batch.states, batch.length)[..., 0]
         moving = valid_steps(batch.states, batch.length)[:, 1:]
         return (offset - batch.states[..., 0])[:, 1:][moving].square()

@@ -1,0 +1,134 @@
+"""Scenes as files tell them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from tests.scenes.own_networks import OwnNetwork
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DRIVER_PROFILES, POPULATIONS, Population
+from tint_sumo.errors import InputError
+from tint_sumo.scenes import (
+    ALL_SCENES,
+    SCENES,
+    Scene,
+    described,
+    digest_of,
+    find_scene,
+    read_described,
+    read_scene,
+    scene_settings,
+)
+from tint_sumo.structures import plain
+
+SHY = {
+    "name": "shy",
+    "desired_speed_mps": [1, 1.5],
+    "min_gap_m": [2, 3],
+    "entry_gap_m": [6, 8],
+    "yields": True,
+    "colour": "0,0,0",
+}
+
+
+def changed(**settings: Any) -> Scene:
+    scene = read_scene({"base": "four_way", **settings})
+    assert isinstance(scene, Scene)
+    return scene
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_with_its_own_numbers_is_the_built_in_one(name: str) -> None:
+    assert read_scene({"base": name}) == name
+    assert read_scene(plain(scene_settings(name))) == name
+    assert read_described(described(name)) == name
+
+
+def test_what_is_not_said_is_as_in_the_base() -> None:
+    scene, base = changed(time_limit_s=20, controller={"gain_per_s": 1}), find_scene("four_way")
+    assert scene.time_limit_s == 20.0
+    assert scene.ego == replace(base.ego, controller=replace(base.ego.controller, gain_per_s=1.0))
+    assert replace(scene, name=base.name, base="", ego=base.ego, time_limit_s=base.time_limit_s) == base
+
+
+def test_a_changed_scene_has_a_name_of_its_own() -> None:
+    assert changed(time_limit_s=20, name="short").name == "short"
+    names = {changed(time_limit_s=limit_s).name for limit_s in (20, 30)}
+    assert len(names) == 2
+    assert all(name.startswith("four_way-") for name in names)
+    assert changed(time_limit_s=20).name in names
+
+
+@pytest.mark.parametrize(
+    ("settings", "tells_apart"),
+    [
+        ({"claim": {"braking_mps2": 3}}, True),
+        ({"step_s": 0.2}, True),
+        ({"goal_m": 30}, True),
+        ({"max_vehicles": 5}, True),
+        ({"population": [SHY]}, False),  # drivers and their mix do not count
+        ({"arrivals_per_s": 0.1}, False),
+    ],
+)
+def test_the_digest_tells_roads_and_tasks_apart(settings: dict[str, Any], tells_apart: bool) -> None:
+    assert (changed(**settings).digest != digest_of("four_way")) == tells_apart
+
+
+def test_a_card_tells_all_of_a_changed_scene() -> None:
+    scene = changed(arrivals_per_s=0.2, population=[SHY, {**SHY, "name": "bold", "yields": False}], step_s=0.05)
+    card = described(scene)
+    assert (card["scene"], card["scene_digest"]) == (scene.name, scene.digest)
+    assert read_described(card) == scene
+    assert set(described("four_way")) == {"scene", "scene_digest"}
+    assert read_described(described(ALL_SCENES)) == ALL_SCENES
+
+
+def test_a_sumo_configuration(own_network: Callable[[str], OwnNetwork]) -> None:
+    merge = own_network("merge")
+    task = {"ego_route": list(merge.ego_route), "start_m": 20, "goal_m": 130, "warm_up_s": 20}
+    scene = read_scene({"sumocfg": str(merge.sumocfg), **task})
+    assert scene == merge.scene()
+    assert read_described(described(scene)) == scene
+    with pytest.raises(InputError, match=r"scene: the ego's start \(20 m\) and goal \(900 m\) must lie on its route"):
+        read_scene({"sumocfg": str(merge.sumocfg), **task, "goal_m": 900}, ("scene",))
+
+
+def test_populations() -> None:
+    assert Population.from_file("continuous") == POPULATIONS["continuous"]
+    assert Population.from_file({"base": "continuous", "members": 8}) == replace(POPULATIONS["continuous"], members=8)
+    assert Population.from_file({"idm": {"tau_s": 2}}).profiles == DRIVER_PROFILES
+    assert [profile.name for profile in Population.from_file([SHY]).profiles] == ["shy"]
+    assert Population.from_file(plain(POPULATIONS["traits"])) == POPULATIONS["traits"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"name": "two words"}, "name must be of letters"),
+        (
+            {"desired_speed_mps": [2, 1]},
+            "desired_speed_mps must be two numbers from low to high, .* not 2 and 1",
+        ),
+        ({"desired_speed_mps": [0, 1]}, "desired_speed_mps must be above 0"),
+        ({"min_gap_m": [-1, 1]}, "min_gap_m must be two numbers from low to high"),
+        ({"entry_gap_m": 3}, r"population\[0\].entry_gap_m: must be a list of 2, each item a number, not 3"),
+        ({"colour": "blue"}, 'colour must be "red,green,blue", each 0 to 255'),
+        ({"colour": "1,2,300"}, "each 0 to 255"),
+        ({"weight": 0}, "weight must be above 0"),
+        ({"yields": "maybe"}, r"population\[0\].yields: must be true or false, not 'maybe'"),
+        ({"speed": 3}, r"population\[0\].speed: there is no such setting"),
+    ],
+)
+def test_wrong_profiles(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Population.from_file([{**SHY, **wrong}], ("population",))
+
+
+def test_wrong_populations() -> None:
+    for profiles, message in (((), "profiles must be 1 to 127, not 0"), ((CONSERVATIVE,) * 2, "names of their own")):
+        with pytest.raises(InputError, match=message):
+            Population(profiles)
+    with pytest.raises(InputError, match="population: profiles must have names of their own, not shy, shy"):
+        Population.from_file([SHY, SHY], ("population",))
+    assert Population((AGGRESSIVE,)).profiles == (AGGRESSIVE,)

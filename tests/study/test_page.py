@@ -1,0 +1,288 @@
+"""The page without a browser: what it shows, what it leaves out, and that nothing in it leads elsewhere."""
+
+import base64
+import gzip
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.study.scenes import given, trained, write_results
+from tint_sumo.errors import InputError
+from tint_sumo.files import write_text
+from tint_sumo.progress import silent
+from tint_sumo.scenes import SCENES, find_scene
+from tint_sumo.scenes.geometry import POSE
+from tint_sumo.scenes.layout import layout
+from tint_sumo.study.budgets import ALL_MIXES, Conditions
+from tint_sumo.study.driving import Moment, drive_case
+from tint_sumo.study.evaluation import Case, Evaluation
+from tint_sumo.study.loading import load_policy
+from tint_sumo.study.page import write_page
+from tint_sumo.study.page.charts import curve_chart, outcome_chart, world_charts
+from tint_sumo.study.page.choosing import MOST_CASES, choose, choose_cases
+from tint_sumo.study.page.html import json_data, packed, table
+from tint_sumo.study.page.recording import MISSING, UNITS, Recording, RecordJob, encode, read_episodes
+from tint_sumo.study.page.roads import scene_shapes
+from tint_sumo.study.policy_jobs import read_curves
+from tint_sumo.study.report import write_report
+from tint_sumo.study.rows import tabulate
+from tint_sumo.study.trait_reader import TraitReader
+
+
+def outcomes(*shorts: str) -> Evaluation:
+    names = {"s": "success", "t": "timeout", "c": "collision"}
+    return Evaluation(tuple(Case(names[short], 10.0) for short in "".join(shorts)))
+
+
+def decoded(name: str, column: list[int]) -> list[float]:
+    return [np.nan if number == MISSING else number * UNITS[name] for number in np.cumsum(column).tolist()]
+
+
+# What is chosen
+
+
+def test_every_policy_has_failures_of_both_kinds_and_some_successes_among_the_cases() -> None:
+    good, bad = outcomes("sssscssssst", "s" * 20), outcomes("cccctcccccc", "s" * 20)
+    chosen = choose_cases([bad, good])
+    assert chosen == tuple(sorted(chosen))
+    assert {4, 10} <= set(chosen)  # the good one's only failures
+    assert {bad.cases[number].outcome for number in chosen} == {"success", "timeout", "collision"}
+    assert sum(good.cases[n].outcome == bad.cases[n].outcome == "success" for n in chosen) == 2
+    assert len(chosen) == 2 + 1 + 2  # case 10 is a collision of the bad one, and one more joins it
+
+
+def test_however_often_policies_fail_the_number_of_cases_is_bounded() -> None:
+    failing = [outcomes("s" * 4 * one, "cctt", "s" * (100 - 4 * one)) for one in range(20)]  # each its own cases
+    assert len(choose_cases(failing)) == MOST_CASES
+    assert choose_cases([outcomes("cc")]) == (0, 1)
+
+
+def test_the_middle_mix_that_most_policies_met_is_shown_with_first_seeds() -> None:
+    counts = (3, 1, 1)
+    mixes = {Conditions(p): counts for p in (0.1, 0.25, 0.4, 0.6, 0.9)}
+    rows = tabulate(
+        [
+            given("ttc", {**mixes, Conditions(0.5): counts, Conditions(ALL_MIXES): counts}),
+            *(trained("oracle", seed, mixes) for seed in (3, 4)),
+            given("oracle", mixes),
+        ]
+    )
+    choice = choose(rows)
+    assert choice.conditions == Conditions(0.4)
+    assert [one.label for one in choice.policies] == ["ttc", "oracle-shipped", "oracle-P0.1to0.9-seed3"]
+    only_worlds = choose(tabulate([given("ttc", {Conditions(ALL_MIXES, 0.1): counts})]))
+    assert only_worlds.conditions == Conditions(ALL_MIXES, 0.1)
+
+
+# What is recorded
+
+
+def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -> Moment:
+    """One with two slots and two routes; the first slot's vehicle stands at ``x_m``."""
+    poses = np.zeros(2, POSE)
+    poses[0] = (x_m, -2.5, 0.0, 1.0)
+    poses[1] = (8.0, 1.25, -1.0, 0.0)
+    told = np.array([[2.0], [0.0]])
+    common = Moment(
+        time_s=0.1,
+        ego=poses[1],
+        ego_mps=1.5,
+        ego_brakes=True,
+        is_held=False,
+        present=np.array([number >= 0 for number in vehicles]),
+        vehicles=np.array(vehicles),
+        poses=poses,
+        brakes=np.array([False, True]),
+        traits=np.array([0, 1]),
+        told=told,
+        attention=np.array([0.75, 0.25]),
+        claimed=np.array([False, True]),
+        desired_mps=3.0,
+        value=-1.25,
+        outcome=outcome,
+    )
+    return replace(common, **changes)
+
+
+def test_an_episode_survives_its_small_numbers() -> None:
+    moments = [
+        moment([7, -1], -3.14, desired_mps=None, value=None),
+        moment([7, 2], 1.5),
+        moment([9, 2], 40.0, "collision", claimed=np.array([True, True]), time_s=0.2),
+    ]
+    reader = TraitReader(np.array([1.0]), 0.0, has_spread=False)
+    episode = json.loads(json.dumps(encode(moments, reader, ["lower", "upper"])))
+    assert (episode["outcome"], episode["time_s"], episode["frames"]) == ("collision", 0.2, 3)
+    assert [(one["number"], one["trait"], one["first"]) for one in episode["vehicles"]] == [
+        (2, 1, 1),
+        (7, 0, 0),
+        (9, 0, 2),
+    ]
+    second, seventh, _ = episode["vehicles"]
+    assert decoded("x_m", seventh["x_m"]) == pytest.approx([-3.14, 1.5], abs=0.005)
+    assert decoded("y_m", seventh["y_m"]) == pytest.approx([-2.5, -2.5], abs=0.005)
+    assert decoded("heading_deg", seventh["heading_deg"]) == [90.0, 90.0]
+    assert decoded("attention", seventh["attention"]) == pytest.approx([0.75, 0.75])
+    assert decoded("p_conservative", seventh["p_conservative"]) == pytest.approx([0.88, 0.88])
+    assert np.isnan(decoded("p_conservative", second["p_conservative"])).all()  # nothing was told of it
+    assert decoded("brakes", second["brakes"]) == [1.0, 1.0]
+    ego = episode["ego"]
+    np.testing.assert_allclose(decoded("value", ego["value"]), [np.nan, -1.25, -1.25])
+    np.testing.assert_allclose(decoded("desired_mps", ego["desired_mps"]), [np.nan, 3.0, 3.0])
+    assert decoded("claimed", episode["routes"]["lower"]["claimed"]) == [0.0, 0.0, 1.0]
+
+
+def test_rules_have_no_value_no_attention_and_nothing_inferred() -> None:
+    bare = [replace(moment([1, 2], 0.0, "timeout"), value=None, attention=None, told=None)]
+    episode = encode(bare, None, ["lower", "upper"])
+    assert "value" not in episode["ego"]
+    assert not {"attention", "p_conservative"} & set(episode["vehicles"][0])
+
+
+def test_recordings_tell_the_case_and_are_made_once_for_a_policy_and_its_cases(tmp_path: Path) -> None:
+    recording = Recording("always_go", None, 0, Conditions(0.4), (2, 0), tmp_path)
+    job = RecordJob(0, (recording,))
+    assert not job.is_done()
+    assert job.run(silent) == "policies: 1"
+    episodes = read_episodes(recording.file)
+    assert list(episodes) == [2, 0]
+    driven = list(drive_case(load_policy("always_go"), 2, 0, p_conservative=0.4))
+    assert (episodes[2]["outcome"], episodes[2]["frames"]) == (driven[-1].outcome, len(driven))
+    assert decoded("x_m", episodes[2]["ego"]["x_m"]) == pytest.approx([one.ego["x_m"] for one in driven], abs=0.006)
+    written = recording.file.read_bytes()
+    assert job.is_done() and job.run(silent) == "policies: 0"
+    other = replace(recording, cases=(0,))
+    assert not other.is_done() and not replace(recording, conditions=Conditions(0.6)).is_done()
+    recording.file.unlink()
+    recording.make(silent)
+    assert recording.file.read_bytes() == written
+
+
+def test_damaged_recordings_are_named_in_one_line(tmp_path: Path) -> None:
+    write_text(tmp_path / "one.json", '{"episodes": [1]}')
+    with pytest.raises(InputError, match=r"one\.json is damaged .* remove it"):
+        read_episodes(tmp_path / "one.json")
+
+
+# What is drawn
+
+
+@pytest.mark.parametrize("name", sorted(SCENES))
+def test_the_roads_of_every_scene_lie_in_its_picture(name: str) -> None:
+    shapes, roads = scene_shapes(name), layout(find_scene(name))
+    left, top, width, height = shapes["view"]
+    points = np.array(
+        [[float(part) for part in pair.split()] for pair in re.findall(r"-?[\d.]+ -?[\d.]+", shapes["way"])]
+    )
+    assert (points >= [left, top]).all() and (points <= [left + width, top + height]).all()
+    start_m, goal_m = (roads.ego.way[round(at_m / 0.02)] for at_m in (roads.scene.ego.start_m, roads.scene.ego.goal_m))
+    np.testing.assert_allclose(points[[0, -1]] * [1, -1], [start_m, goal_m], atol=0.05)
+    assert set(shapes["routes"]) == {route.name for route in roads.scene.routes}
+    assert shapes["roads"].count("M") == shapes["roads"].count("Z") >= 1
+    json.dumps(shapes, allow_nan=False)
+
+
+def test_charts_and_their_tables_tell_the_rates_and_intervals() -> None:
+    rows = tabulate([trained("oracle", seed, {Conditions(0.4): (8 + seed, 2 - seed, 0)}) for seed in (0, 1)])
+    chart = outcome_chart(rows, "success")
+    (trace,) = chart.figure["data"]
+    low, high = rows[0].intervals["success"]
+    assert trace["x"] == [85.0]
+    assert trace["x"][0] + trace["error_x"]["array"][0] == pytest.approx(100 * high, abs=0.01)
+    assert trace["x"][0] - trace["error_x"]["arrayminus"][0] == pytest.approx(100 * low, abs=0.01)
+    assert chart.lines[1:] == [["oracle", "0.4", "85.0", f"{100 * low:.1f} to {100 * high:.1f}"]]
+
+
+def test_worlds_have_a_chart_for_every_condition_that_varies() -> None:
+    noisy, later = Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, tau_s=1.5)
+    rows = tabulate([given("ttc", {Conditions(ALL_MIXES): (4, 0, 1), noisy: (3, 0, 2), later: (2, 0, 3)})])
+    noise, headway = world_charts(rows)
+    assert (noise.figure["data"][0]["x"], noise.figure["data"][0]["y"]) == ([0.0, 0.1], [80.0, 60.0])
+    assert (headway.figure["data"][0]["x"], headway.figure["data"][0]["y"]) == ([1.0, 1.5], [80.0, 40.0])
+
+
+def test_curves_are_means_with_a_band_where_there_are_seeds(tmp_path: Path) -> None:
+    for seed, last in enumerate((0.6, 0.8)):
+        text = f"decisions,success,timeout,collision\n64,0.2,0.4,0.4\n128,{last},0.1,0.1\n"
+        write_text(tmp_path / "policies" / f"oracle-P0.4-seed{seed}" / "curve.csv", text)
+    chart = curve_chart(read_curves(tmp_path))
+    band, line = chart.figure["data"]
+    assert line["y"] == [20.0, 45.0] and line["x"] == [64.0, 128.0]
+    assert band["y"] == [20.0, 40.0, 50.0, 20.0] and not band["showlegend"]
+    assert chart.lines[-1] == ["oracle", "128", "45.0", "40.0 to 50.0"]
+
+
+# Pieces of HTML
+
+
+def test_text_is_never_markup() -> None:
+    cells = table([["<b>", "&"], ["</table>", '"x"']], 'all "of" <it>')
+    assert not re.search(r"<b>|</table>.*</table>|&\s|<it>", cells)
+    assert "&lt;b&gt;" in cells and "&quot;of&quot;" in cells
+    data = json_data("one", {"text": "</script><!--"})
+    assert data.count("</script>") == 1 and "<!--" not in data
+    assert json.loads(re.sub(r"^<[^>]+>|<[^<]+$", "", data)) == {"text": "</script><!--"}
+
+
+def test_packed_text_is_the_same_every_time_and_can_be_unpacked() -> None:
+    text = "</script> äöü " * 1000
+    one = packed("name", text)
+    assert one == packed("name", text) and len(one) < 1000
+    content = re.fullmatch(r'<script type="text/plain" id="name">(.*)</script>', one)
+    assert content is not None
+    assert gzip.decompress(base64.b64decode(content[1])).decode() == text
+
+
+# The page
+
+
+def section(page: str, name: str) -> str:
+    found = re.search(rf'<section id="{name}".*?</section>', page, re.DOTALL)
+    assert found is not None
+    return found[0]
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The page of a study whose policies are gone, and that tested in one other world alone."""
+    out = tmp_path_factory.mktemp("bare")
+    counts = {Conditions(0.4): (18, 1, 1)}
+    write_results([trained("oracle", 0, counts), trained("no_labels", 0, counts)], out)
+    report = write_page(write_report(out), out, progress=False)
+    assert report.page_file == out / "report.html"
+    return report.page_file.read_text()
+
+
+def test_sections_without_data_say_why_they_are_left_out(bare: str) -> None:
+    for name, reason in (
+        ("curves", "the study's folder has no learning curves"),
+        ("worlds", "the world of their training alone"),
+        ("player", "none of the study's policies can be loaded"),
+        ("failures", "no episodes were recorded"),
+        ("latents", "no method of the study infers traits with a model"),
+        ("making", "the study's folder has no settings"),
+    ):
+        assert "left out" in section(bare, name) and reason in section(bare, name).replace("&#x27;", "'")
+    assert "no policy" in section(bare, "player")
+    assert "90.0" in section(bare, "results")
+    assert not re.search(r'id="(episode-|player-data|latent-data)', bare)
+
+
+def test_the_page_leads_nowhere_else_and_is_small(bare: str) -> None:
+    assert set(re.findall(r"https?://[^\"'\s)]+", bare)) == {"http://www.w3.org/2000/svg"}  # a name, not a place
+    assert not re.search(r"<(link|script|img|iframe)[^>]+(src|href)=\"(?!data:)", bare)
+    assert "default-src 'none'" in bare
+    assert len(bare) < 10_000_000
+
+
+def test_a_page_is_the_same_every_time(tmp_path: Path) -> None:
+    out = write_results([given("always_go", {Conditions(ALL_MIXES): (1, 0, 0)})], tmp_path)
+    Recording("always_go", None, 0, Conditions(ALL_MIXES), (0,), out).make(silent)
+    first, second = (write_page(write_report(out), out, progress=False).page_file for _ in range(2))
+    assert first is not None and second is not None
+    assert first.read_bytes() == second.read_bytes()

@@ -1,0 +1,181 @@
+"""Scenes as files tell them: a built-in one with other numbers, or a SUMO configuration and the ego's task in it."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Self
+
+from tint_sumo.config import Claim, EgoController, Population, VehicleShape
+from tint_sumo.errors import InputError
+from tint_sumo.scenes.own import OwnScene, from_sumocfg
+from tint_sumo.scenes.scene import ALL_SCENES, SCENES, T_INTERSECTION, Scene, digest_of, find_scene
+from tint_sumo.structures import FieldError, Where, build, overlay, plain, require_known
+
+AnyScene = str | Scene | OwnScene
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """What can be changed in a built-in scene; its roads cannot."""
+
+    base: str
+    """The built-in scene whose roads these are."""
+    name: str | None
+    """What the scene is called if it differs from its base; null: the base's name and a number are joined."""
+    start_m: float
+    """Where the ego's front starts on its way."""
+    goal_m: float
+    """The ego's front past it is a success."""
+    controller: EgoController
+    """How the ego drives; its desired speeds are the actions."""
+    claim: Claim
+    """When the ego claims a lane, and who reacts to that."""
+    population: Population
+    """Who drives: traits, continuous, a list of profiles, or a mapping of what differs from them."""
+    arrivals_per_s: float | None
+    """Rate of drivers who come on each route; null: as many as there is room for."""
+    max_vehicles: int
+    """Most vehicles on the roads, and in an observation."""
+    step_s: float
+    """Step of the simulation."""
+    time_limit_s: float
+    """Of an episode."""
+
+    def __post_init__(self) -> None:
+        if self.name in SCENES:
+            raise InputError(f"name must not be that of a built-in scene, {self.name}; choose another one")
+
+    @classmethod
+    def of(cls, scene: Scene) -> Self:
+        """The numbers of a scene that is built in, or made from one that is."""
+        return cls(
+            base=scene.base or scene.name,
+            name=scene.name if scene.base else None,
+            start_m=scene.ego.start_m,
+            goal_m=scene.ego.goal_m,
+            controller=scene.ego.controller,
+            claim=scene.claim,
+            population=scene.population,
+            arrivals_per_s=scene.traffic.arrivals_per_s,
+            max_vehicles=scene.max_vehicles,
+            step_s=scene.step_s,
+            time_limit_s=scene.time_limit_s,
+        )
+
+    def scene(self) -> str | Scene:
+        """The scene with these numbers; its name where they are those of the built-in one."""
+        base = find_scene(self.base)
+        if replace(self, name=None) == SceneSettings.of(base):
+            return base.name
+        ego = replace(base.ego, start_m=self.start_m, goal_m=self.goal_m, controller=self.controller)
+        return replace(
+            base,
+            base=base.name,
+            name=self.name or f"{base.name}-{_digest(plain(self))}",
+            ego=ego,
+            claim=self.claim,
+            population=self.population,
+            traffic=replace(base.traffic, arrivals_per_s=self.arrivals_per_s),
+            max_vehicles=self.max_vehicles,
+            step_s=self.step_s,
+            time_limit_s=self.time_limit_s,
+        )
+
+
+@dataclass(frozen=True)
+class OwnSceneSettings:
+    """The arguments of ``tint_sumo.scenes.from_sumocfg``."""
+
+    sumocfg: Path
+    """SUMO configuration; its step length is the scene's."""
+    ego_route: tuple[str, ...]
+    """Edges that the ego drives along, one after the other."""
+    start_m: float
+    """Where on its route the ego's front is at the beginning; not on a junction."""
+    goal_m: float
+    """The ego's front past it is a success."""
+    max_vehicles: int = OwnScene.max_vehicles
+    """Most vehicles in an observation, the nearest ones."""
+    sight_m: float = OwnScene.sight_m
+    """How far away they may be."""
+    warm_up_s: float = OwnScene.warm_up_s
+    """For how long the traffic runs before the ego appears."""
+    time_limit_s: float = OwnScene.time_limit_s
+    """Of an episode."""
+    vehicle: VehicleShape = field(default_factory=VehicleShape)
+    """The ego's shape."""
+    controller: EgoController = field(default_factory=EgoController)
+    """How the ego drives; its desired speeds are the actions."""
+
+    @classmethod
+    def of(cls, scene: OwnScene) -> Self:
+        found = {one.name: getattr(scene, one.name) for one in fields(cls) if one.name != "sumocfg"}
+        return cls(sumocfg=scene.config.file, **found)
+
+    def scene(self) -> OwnScene:
+        return from_sumocfg(**{one.name: getattr(self, one.name) for one in fields(self)})
+
+
+def _digest(settings: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:6]
+
+
+def read_scene(value: Any, where: Where = ()) -> AnyScene:
+    """What a file means by a scene: a name, what differs from its ``base``, or a ``sumocfg`` and the ego's task.
+
+    Returns:
+        The name of a built-in scene, or another scene.
+
+    Raises:
+        FieldError: there is no such scene, or a value does not fit.
+    """
+    if isinstance(value, str):
+        return require_known(value, SCENES, where)
+    if not isinstance(value, Mapping):
+        raise FieldError(where, f"must be a name ({', '.join(SCENES)}) or a mapping of settings, not {value!r}")
+    if "sumocfg" in value:
+        settings: Any = build(OwnSceneSettings, value, where)
+    else:
+        base = require_known(value.get("base", T_INTERSECTION), SCENES, (*where, "base"))
+        settings = overlay(SceneSettings.of(find_scene(base)), value, where)
+    try:
+        made: AnyScene = settings.scene()
+    except InputError as error:
+        raise FieldError(where, str(error)) from None
+    return made
+
+
+def scene_settings(scene: AnyScene) -> SceneSettings | OwnSceneSettings:
+    """What a file says of a scene, in full.
+
+    Raises:
+        InputError: there is no such scene, or its roads are those of no built-in one.
+    """
+    found = find_scene(scene)
+    if isinstance(found, OwnScene):
+        return OwnSceneSettings.of(found)
+    if (found.base or found.name) not in SCENES:
+        raise InputError(f"the roads of scene {found.name} are of no built-in scene; register it in SCENES")
+    return SceneSettings.of(found)
+
+
+def described(scene: AnyScene) -> dict[str, Any]:
+    """What the settings and the card of a run say of its scene, or of all; ``read_described`` finds it again."""
+    if isinstance(scene, str):
+        return {"scene": scene, "scene_digest": digest_of(scene)}
+    changed = isinstance(scene, OwnScene) or scene.base
+    settings = {"scene_settings": plain(scene_settings(scene))} if changed else {}
+    return {"scene": scene.name, "scene_digest": scene.digest, **settings}
+
+
+def read_described(card: Mapping[str, Any]) -> AnyScene:
+    """The scene of a card, or the name of all.
+
+    Raises:
+        FieldError: there is no such scene, or a value does not fit.
+    """
+    if card.get("scene") == ALL_SCENES:
+        return ALL_SCENES
+    return read_scene(card.get("scene_settings", card.get("scene")), ("scene",))

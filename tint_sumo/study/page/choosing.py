@@ -1,0 +1,71 @@
+"""Which policies of a study are shown, and in which cases."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from tint_sumo.config import Share
+from tint_sumo.study.budgets import Conditions
+from tint_sumo.study.evaluation import Evaluation
+from tint_sumo.study.policy_jobs import label
+from tint_sumo.study.rows import Row, at_mixes, by_title, over_all_mixes
+
+FAILURES = ("collision", "timeout")
+MOST_CASES = 14
+_FAILURES_OF_EACH = 2  # of each kind and policy, as far as there is room
+_SUCCESSES = 2
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One policy of a method: that of its first seed."""
+
+    title: str
+    method: str
+    mix: Share | None  # P(conservative) in training; None where the study did not train
+    seed: int
+    evaluation: Evaluation  # of all cases that it was tested on
+
+    @property
+    def label(self) -> str:
+        return label(self.method, self.mix, self.seed)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is shown: all policies on the same cases."""
+
+    conditions: Conditions
+    policies: tuple[Shown, ...]
+    cases: tuple[int, ...]
+
+
+def choose(rows: Sequence[Row]) -> Choice:
+    """A world in which most policies were tested, the middle one of several, and cases that tell them apart."""
+    tested = at_mixes(rows) or over_all_mixes(rows)
+    numbers = {one: sum(row.conditions == one for row in tested) for one in (row.conditions for row in tested)}
+    common = [one for one, number in numbers.items() if number == max(numbers.values())]
+    conditions = common[(len(common) - 1) // 2]
+    firsts = {title: own[0] for title, own in by_title([row for row in tested if row.conditions == conditions]).items()}
+    policies = tuple(
+        Shown(title, row.method, row.mix, row.seeds[0], row.evaluations[0]) for title, row in firsts.items()
+    )
+    return Choice(conditions, policies, choose_cases([one.evaluation for one in policies]))
+
+
+def choose_cases(evaluations: Sequence[Evaluation]) -> tuple[int, ...]:
+    """Numbers of cases in which policies fail, first those of the policies that rarely do, and of some successes.
+
+    A case in which several policies fail counts for all of them.
+    """
+    common = range(min(len(one.cases) for one in evaluations))
+    best_first = sorted(evaluations, key=lambda one: -one.rate("success").value)
+    chosen: list[int] = []
+    for wanted in range(1, _FAILURES_OF_EACH + 1):
+        for one in best_first:
+            for outcome in FAILURES:
+                failed = [number for number in common if one.cases[number].outcome == outcome]
+                missing = wanted - len(set(failed) & set(chosen))
+                chosen += [number for number in failed if number not in chosen][: max(missing, 0)]
+    successes = [sum(one.cases[number].outcome == "success" for one in evaluations) for number in common]
+    finished = sorted((number for number in common if number not in chosen), key=lambda number: -successes[number])
+    return tuple(sorted([*chosen[: MOST_CASES - _SUCCESSES], *finished[:_SUCCESSES]]))

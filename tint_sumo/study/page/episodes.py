@@ -1,0 +1,153 @@
+"""The page's sections on single episodes: the player, and the list of failures."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from tint_sumo.config import ends
+from tint_sumo.errors import InputError
+from tint_sumo.scenes import Scene
+from tint_sumo.study.budgets import Conditions
+from tint_sumo.study.evaluation import Case
+from tint_sumo.study.methods import METHODS
+from tint_sumo.study.page.choosing import FAILURES, Choice, Shown
+from tint_sumo.study.page.html import bullets, json_data, packed, paragraph
+from tint_sumo.study.page.recording import MISSING, UNITS, Recording, read_episodes, record_all
+from tint_sumo.study.page.roads import scene_shapes
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The episodes of one policy."""
+
+    policy: Shown
+    episodes: dict[int, dict[str, Any]]  # by the number of the case
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """What the player can show."""
+
+    scene: str | Scene
+    choice: Choice
+    policies: tuple[Recorded, ...]
+    refusals: tuple[str, ...]  # why policies are not among them
+
+
+def record_episodes(out: Path, scene: str | Scene, choice: Choice, *, workers: int, progress: bool) -> Recordings:
+    """Record the chosen cases of all policies that can be loaded, as far as they are not there already.
+
+    Raises:
+        InputError: a file of recorded episodes is damaged.
+    """
+    ready: list[tuple[Shown, Recording]] = []
+    refusals = []
+    for one in choice.policies:
+        recording = Recording(one.method, one.mix, one.seed, choice.conditions, choice.cases, out, scene)
+        try:
+            recording.require_policy()
+        except InputError as error:
+            refusals.append(f"{one.title}: {error}")
+        else:
+            ready.append((one, recording))
+    record_all([recording for _, recording in ready], workers, progress)
+    recorded = tuple(Recorded(one, read_episodes(recording.file)) for one, recording in ready)
+    return Recordings(scene, choice, recorded, tuple(refusals))
+
+
+def player_data(recordings: Recordings) -> str:
+    """What the player's script reads: a table of contents, and each episode by its own."""
+    contents = {
+        "units": UNITS,
+        "missing": MISSING,
+        "opening": _opening(recordings.policies).label,
+        "scene": scene_shapes(recordings.scene),
+        "policies": [
+            {
+                "label": one.policy.label,
+                "title": one.policy.title,
+                "outcomes": {str(case): episode["outcome"] for case, episode in one.episodes.items()},
+            }
+            for one in recordings.policies
+        ],
+    }
+    episodes = [
+        packed(f"episode-{one.policy.label}-{case}", json.dumps(episode, separators=(",", ":")))
+        for one in recordings.policies
+        for case, episode in one.episodes.items()
+    ]
+    return json_data("player-data", contents) + "".join(episodes)
+
+
+def _opening(policies: Sequence[Recorded]) -> Shown:
+    """The policy that is shown first: the most successful one of those that infer traits, or else of all."""
+    inferring = [one for one in policies if getattr(METHODS.get(one.policy.method), "encoder", None)]
+    return max((one.policy for one in inferring or policies), key=lambda one: one.evaluation.rate("success").value)
+
+
+def player_notes(recordings: Recordings) -> str:
+    """What a reader should know of the recorded episodes."""
+    choice = recordings.choice
+    parts = [
+        paragraph(
+            f"Each method is shown with its policy of the first seed, in the same {len(choice.cases)} of the study's "
+            f"cases ({_world(choice.conditions)}): failures of every method, and a few successes. "
+            "The policies take their likeliest actions, as they did in the tests."
+        )
+    ]
+    if differing := _differing(recordings):
+        parts.append(
+            paragraph(
+                f"{differing} of the recorded episodes ended otherwise than in the study's tests: another version of "
+                "a package or another machine was at work then. The player shows what was recorded now."
+            )
+        )
+    return "".join([*parts, *(paragraph(f"Left out: {refusal}") for refusal in recordings.refusals)])
+
+
+def failure_lists(recordings: Recordings) -> str:
+    """Of each policy: how often it failed, and its recorded failures as buttons that open the player."""
+    return "".join(_failures(one) for one in recordings.policies)
+
+
+def _failures(one: Recorded) -> str:
+    cases = one.policy.evaluation.cases
+    counts = {outcome: sum(case.outcome == outcome for case in cases) for outcome in FAILURES}
+    failed = {case: episode for case, episode in one.episodes.items() if episode["outcome"] in FAILURES}
+    told = " and ".join(_count(number, outcome) for outcome, number in counts.items())
+    buttons = [
+        f'<button type="button" data-policy="{escape(one.policy.label)}" data-case="{case}">'
+        f"{escape(_told(case, episode, cases[case]))}</button>"
+        for case, episode in failed.items()
+    ]
+    note = paragraph(f"{told} in {len(cases)} cases. Failures among the recorded cases: {len(failed)}.")
+    return f"<h3>{escape(one.policy.title)}</h3>" + note + (bullets(buttons) if buttons else "")
+
+
+def _told(number: int, episode: dict[str, Any], case: Case) -> str:
+    text = f"Case {number}: {episode['outcome']} after {episode['time_s']:.1f} s"
+    return text + (f" ({case.trait}, {case.route})" if _agree(episode, case) and case.trait else "")
+
+
+def _agree(episode: dict[str, Any], case: Case) -> bool:
+    return (episode["outcome"], episode["time_s"]) == (case.outcome, case.time_s)
+
+
+def _differing(recordings: Recordings) -> int:
+    return sum(
+        not _agree(episode, one.policy.evaluation.cases[number])
+        for one in recordings.policies
+        for number, episode in one.episodes.items()
+    )
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" + ("" if number == 1 else "s")
+
+
+def _world(conditions: Conditions) -> str:
+    low, high = ends(conditions.p_conservative)
+    return f"P(conservative) {low:g}" + (f" to {high:g}" if high > low else "")

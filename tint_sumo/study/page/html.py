@@ -1,0 +1,66 @@
+"""Pieces of HTML."""
+
+import base64
+import gzip
+import json
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+from tint_sumo.study.tables import Lines
+
+
+def table(lines: Lines, caption: str) -> str:
+    """A table of cells in a box that scrolls by itself; the first line is its header, the first column its rows'."""
+    header, *rows = lines
+    head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in header)
+    body = "".join(
+        "<tr>"
+        + f'<th scope="row">{escape(row[0])}</th>'
+        + "".join(f"<td>{escape(cell)}</td>" for cell in row[1:])
+        + "</tr>"
+        for row in rows
+    )
+    return (
+        f'<div class="scrolls" tabindex="0" role="region" aria-label="{escape(caption)}"><table>'
+        f"<caption>{escape(caption)}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    )
+
+
+def folded(summary: str, *content: str) -> str:
+    """Something that opens when it is asked for, and in print."""
+    return f"<details><summary>{escape(summary)}</summary>{''.join(content)}</details>"
+
+
+def paragraph(text: str) -> str:
+    return f"<p>{escape(text)}</p>"
+
+
+def section(name: str, title: str, *content: str) -> str:
+    return f'<section id="{name}" aria-labelledby="{name}-title"><h2 id="{name}-title">{escape(title)}</h2>' + (
+        "".join(content) + "</section>"
+    )
+
+
+def chart(name: str, description: str, lines: Lines) -> str:
+    """The place of a chart, and its numbers as a table."""
+    return f'<div class="chart" data-chart="{name}" role="img" aria-label="{escape(description)}"></div>' + folded(
+        f"The numbers: {description}", table(lines, description)
+    )
+
+
+def json_data(name: str, value: Any) -> str:
+    """Data that scripts read by their name."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")  # no tag ends it early
+    return f'<script type="application/json" id="{name}">{text}</script>'
+
+
+def packed(name: str, text: str) -> str:
+    """The same for text that is long: compressed, in Base64."""
+    content = base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode("ascii")
+    return f'<script type="text/plain" id="{name}">{content}</script>'
+
+
+def bullets(lines: Sequence[str]) -> str:
+    """A list of pieces of HTML."""
+    return f"<ul>{''.join(f'<li>{line}</li>' for line in lines)}</ul>"

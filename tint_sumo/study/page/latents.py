@@ -1,0 +1,70 @@
+"""What the latent space of each trait model holds, for the page's readers."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tint_sumo import traits
+from tint_sumo.config import LATENT_SIZE, NO_LEADER_GAP_M, POPULATIONS
+from tint_sumo.dataset.recorder import record
+from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows
+from tint_sumo.study.methods import METHODS, Learned
+from tint_sumo.study.page.recording import EPISODES
+from tint_sumo.traits.evaluation import encode_windows
+
+DRAWN = 400  # windows; more would hide each other
+_RECORDED, _SEED = 3000, 404  # unlike that of any dataset a model was trained on
+_P_CONSERVATIVE = 0.5
+_STEP_M = 0.01  # what offsets and gaps are multiples of
+
+
+def read_latents(out: Path, methods: Sequence[str], *, progress: bool) -> dict[str, Any] | None:
+    """Windows of drivers that no model was trained on, and where each of the methods' trait models puts them.
+
+    None if no method infers traits with a model. The windows are recorded once.
+
+    Raises:
+        InputError: a model is damaged.
+    """
+    known = [METHODS[name] for name in methods if name in METHODS]
+    encoders = dict.fromkeys(one.encoder for one in known if isinstance(one, Learned) and one.encoder)
+    if not encoders:
+        return None
+    data = out / EPISODES / "windows"
+    record(data, _RECORDED, p_conservative=_P_CONSERVATIVE, seed=_SEED, progress=progress)
+    windows = load_windows(data)
+    chosen = np.sort(np.random.default_rng(0).permutation(len(windows))[:DRAWN])
+    drawn, labels = windows[chosen], load_labels(data, windows)[chosen]
+    drivers = load_drivers(data, windows, ["desired_speed_mps", "min_gap_m"]).iloc[chosen].round(2)
+    names = [profile.name for profile in POPULATIONS["traits"].profiles]
+    return {
+        "traits": names,
+        "step_m": _STEP_M,
+        "windows": [
+            {
+                "driver": int(drawn.driver[one]),
+                "trait": int(labels[one]),
+                **{name: float(value) for name, value in drivers.iloc[one].items()},
+                **_states(drawn, one),
+            }
+            for one in range(len(drawn))
+        ],
+        "models": [{"name": name, **_model(out, name, drawn)} for name in encoders],
+    }
+
+
+def _states(windows: Windows, one: int) -> dict[str, list[int | None]]:
+    """The window's valid steps; no gap where there is no leader."""
+    steps = windows.states[one, : windows.length[one]]
+    offsets, gaps = np.rint(steps / _STEP_M).astype(int).T.tolist()
+    led = steps[:, 1] < NO_LEADER_GAP_M
+    return {"offsets": offsets, "gaps": [gap if there else None for gap, there in zip(gaps, led, strict=True)]}
+
+
+def _model(out: Path, name: str, windows: Windows) -> dict[str, Any]:
+    own = out / "traits" / name / "model.safetensors"
+    model = traits.load(own if own.exists() else name, latent_size=LATENT_SIZE)
+    latents = encode_windows(model, windows).mean
+    return {"own": own.exists(), "latents": np.round(latents.astype(float), 3).tolist()}

@@ -1,0 +1,236 @@
+"""The study's job of recording episodes for its page: the same cases as they went for every policy."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import tint_sumo
+from tint_sumo.config import Share
+from tint_sumo.errors import InputError
+from tint_sumo.files import read_json, write_text
+from tint_sumo.policy.storage import read_policy_card, weights_file
+from tint_sumo.progress import Progress, Report, part_of
+from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
+from tint_sumo.standings import Title
+from tint_sumo.study.budgets import Conditions
+from tint_sumo.study.driving import Moment, drive_case
+from tint_sumo.study.loading import Contender, find_policy, load_policy
+from tint_sumo.study.methods import METHODS, Rule
+from tint_sumo.study.policy_jobs import CASES, label, policy_path
+from tint_sumo.study.pool import THREADS_PER_JOB, run_jobs
+from tint_sumo.study.trait_reader import TraitReader, fit_reader
+
+EPISODES = "episodes"  # folder of the recorded episodes in a study's folder
+FORMAT = 1  # of the files there
+MISSING = -32768  # a column's number where there is nothing to tell
+# What the numbers of each column are multiples of. A column holds the first number, then what each differs by.
+UNITS = {
+    "x_m": 0.01,
+    "y_m": 0.01,
+    "heading_deg": 1.0,
+    "speed_mps": 0.1,
+    "brakes": 1.0,
+    "held": 1.0,
+    "claimed": 1.0,
+    "desired_mps": 0.1,
+    "value": 0.01,
+    "attention": 0.01,
+    "p_conservative": 0.01,
+}
+
+Column = list[int]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """How a policy drives in some cases, as a file."""
+
+    method: str
+    mix: Share | None  # of its training; None: a rule or a shipped policy
+    seed: int
+    conditions: Conditions
+    cases: tuple[int, ...]
+    out: Path  # folder of the study
+    scene: str | Scene = T_INTERSECTION  # of the study
+
+    @property
+    def label(self) -> str:
+        return label(self.method, self.mix, self.seed)
+
+    @property
+    def file(self) -> Path:
+        return self.out / EPISODES / f"{self.label}.json"
+
+    def require_policy(self) -> None:
+        """Raise InputError unless there is a policy that can be loaded."""
+        self._contender()
+
+    def _contender(self) -> Contender:
+        return load_policy(self._policy, scene=self.scene if self.mix is None else None)
+
+    @property
+    def _policy(self) -> str | Path:
+        return policy_path(self.out, self.method, self.mix, self.seed)
+
+    @property
+    def _identity(self) -> dict[str, Any]:
+        identity = {
+            "format": FORMAT,
+            "policy": _digest(self._policy),
+            "conditions": asdict(self.conditions),
+            "cases": self.cases,
+            "scene": described(self.scene),
+        }
+        read: dict[str, Any] = json.loads(json.dumps(identity))
+        return read
+
+    def is_done(self) -> bool:
+        """Whether the file there is of this very policy and these very cases.
+
+        Raises:
+            InputError: there is no such policy, or the file is damaged.
+        """
+        return self.file.exists() and read_json(self.file, "recorded episodes").get("recorded") == self._identity
+
+    def make(self, report: Report) -> None:
+        contender = self._contender()
+        reader, routes = fit_reader(contender), [route.name for route in find_scene(self.scene).routes]
+        episodes = {}
+        for done, case in enumerate(self.cases):
+            report(Progress(done, len(self.cases), "case"))
+            episodes[str(case)] = encode(
+                list(drive_case(contender, case, CASES, **self.conditions.world)), reader, routes
+            )
+        content = {"recorded": self._identity, "episodes": episodes}
+        write_text(self.file, json.dumps(content, separators=(",", ":")))
+
+
+@dataclass(frozen=True)
+class RecordJob:
+    """Make several recordings in one process: each alone would cost more time to start than to record."""
+
+    number: int
+    recordings: tuple[Recording, ...]
+
+    needs = ()
+
+    @property
+    def name(self) -> str:
+        return f"episodes {self.number}"
+
+    @property
+    def title(self) -> Title:
+        return Title("record", self.name)
+
+    def is_done(self) -> bool:
+        return all(one.is_done() for one in self.recordings)
+
+    def run(self, report: Report) -> str:
+        torch.set_num_threads(THREADS_PER_JOB)
+        missing = [one for one in self.recordings if not one.is_done()]
+        total, done = sum(len(one.cases) for one in missing), 0
+        for one in missing:
+            one.make(part_of(report, done, total))
+            done += len(one.cases)
+        return f"policies: {len(missing)}"
+
+
+def record_all(recordings: Sequence[Recording], workers: int, progress: bool) -> None:
+    """Make the recordings that are not there yet, with up to ``workers`` processes."""
+    missing = tuple(one for one in recordings if not one.is_done())
+    run_jobs([RecordJob(number, missing[number::workers]) for number in range(workers)], workers, progress)
+
+
+def read_episodes(file: Path) -> dict[int, dict[str, Any]]:
+    """The episode of each case.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    content = read_json(file, "recorded episodes")
+    try:
+        return {int(case): dict(one) for case, one in content["episodes"].items()}
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{file} is damaged ({error!r}); remove it and make the report again") from None
+
+
+def _digest(policy: str | Path) -> str:
+    """What tells a policy's weights and its card from others; for a rule the package's version."""
+    if isinstance(METHODS.get(str(policy)), Rule):
+        return tint_sumo.__version__
+    stem = find_policy(policy)
+    card = json.dumps(read_policy_card(stem), sort_keys=True)
+    return hashlib.sha256(weights_file(stem).read_bytes() + card.encode()).hexdigest()
+
+
+def encode(moments: Sequence[Moment], reader: TraitReader | None, routes: Sequence[str]) -> dict[str, Any]:
+    """An episode as small whole numbers: ``outcome``, ``time_s``, ``frames``, columns of the ``ego`` and of each
+    vehicle from its ``first`` frame on, and of each route the column ``claimed``.
+    """
+    last = moments[-1]
+    numbers = np.array([moment.vehicles for moment in moments])
+    return {
+        "outcome": last.outcome,
+        "time_s": round(last.time_s, 3),
+        "frames": len(moments),
+        "ego": _ego(moments),
+        "routes": {
+            name: {"claimed": _column("claimed", [moment.claimed[route] for moment in moments])}
+            for route, name in enumerate(routes)
+        },
+        "vehicles": [_vehicle(moments, reader, numbers, number) for number in np.unique(numbers[numbers >= 0])],
+    }
+
+
+def _ego(moments: Sequence[Moment]) -> dict[str, Column]:
+    columns = {
+        **_pose(np.array([moment.ego for moment in moments])),
+        "speed_mps": [moment.ego_mps for moment in moments],
+        "brakes": [moment.ego_brakes for moment in moments],
+        "held": [moment.is_held for moment in moments],
+        "desired_mps": [np.nan if moment.desired_mps is None else moment.desired_mps for moment in moments],
+        "value": [np.nan if moment.value is None else moment.value for moment in moments],
+    }
+    return {name: _column(name, values) for name, values in columns.items() if not np.isnan(values).all()}
+
+
+def _vehicle(
+    moments: Sequence[Moment], reader: TraitReader | None, numbers: NDArray[np.int64], number: int
+) -> dict[str, Any]:
+    """The vehicle keeps its slot while it is there."""
+    frames, slots = np.nonzero(numbers == number)
+    slot, own = int(slots[0]), [moments[frame] for frame in frames.tolist()]
+    columns: dict[str, Any] = {
+        **_pose(np.array([moment.poses[slot] for moment in own])),
+        "brakes": [moment.brakes[slot] for moment in own],
+    }
+    if own[0].attention is not None:
+        columns["attention"] = [moment.attention[slot] for moment in own if moment.attention is not None]
+    if reader is not None:
+        columns["p_conservative"] = reader.p_conservative(
+            np.array([moment.told[slot] for moment in own if moment.told is not None])
+        )
+    return {
+        "number": int(number),
+        "trait": int(own[0].traits[slot]),
+        "first": int(frames[0]),
+        **{name: _column(name, values) for name, values in columns.items()},
+    }
+
+
+def _pose(poses: NDArray[np.void]) -> dict[str, Any]:
+    heading = np.unwrap(np.arctan2(poses["heading_y"], poses["heading_x"]))
+    return {"x_m": poses["x_m"], "y_m": poses["y_m"], "heading_deg": np.degrees(heading)}
+
+
+def _column(name: str, values: Any) -> Column:
+    multiples = np.rint(np.asarray(values, np.float64) / UNITS[name])
+    whole = np.where(np.isnan(multiples), MISSING, multiples).astype(np.int64)
+    return [int(step) for step in np.diff(whole, prepend=0)]

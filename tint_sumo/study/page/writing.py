@@ -1,0 +1,223 @@
+"""The page: its sections, put together with its style and its scripts."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from plotly.offline import get_plotlyjs
+
+import tint_sumo
+from tint_sumo.files import RUN_FILE, read_json, write_text
+from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, read_described
+from tint_sumo.study.page.charts import Chart, curve_chart, outcome_chart, world_charts
+from tint_sumo.study.page.choosing import choose
+from tint_sumo.study.page.episodes import Recordings, failure_lists, player_data, player_notes, record_episodes
+from tint_sumo.study.page.html import chart, folded, json_data, packed, paragraph, section, table
+from tint_sumo.study.page.latents import read_latents
+from tint_sumo.study.policy_jobs import read_curves
+from tint_sumo.study.report import StudyReport
+from tint_sumo.study.rows import Row, at_mixes, over_all_mixes
+from tint_sumo.study.tables import Lines, Table
+from tint_sumo.study.training import POLICY
+
+PAGE_FILE = "report.html"
+_STATIC = Path(__file__).with_name("static")
+_SCRIPTS = ("unpacking.js", "theme.js", "printing.js", "scene.js", "player.js", "latents.js", "charts.js")
+
+
+@dataclass(frozen=True)
+class _Study:
+    """All that the page tells."""
+
+    out: Path
+    rows: tuple[Row, ...]
+    tables: dict[str, Table]  # by their headings
+    curves: Chart | None
+    recordings: Recordings
+    latents: dict[str, Any] | None
+
+
+def write_page(report: StudyReport, out: Path, *, workers: int = 2, progress: bool = True) -> StudyReport:
+    """Write report.html into a study's folder: one file that needs no network.
+
+    The episodes it shows are recorded first, into ``episodes`` there; what is recorded already is not repeated.
+
+    Args:
+        report: of the study.
+        out: the study's folder.
+        workers: processes at a time that record.
+        progress: show progress bars on stderr.
+
+    Returns:
+        The report with the page's file.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    curves = read_curves(out)
+    study = _Study(
+        out,
+        report.rows,
+        {one.heading: one for one in report.tables},
+        curve_chart(curves) if curves else None,
+        record_episodes(out, _scene(out), choose(report.rows), workers=workers, progress=progress),
+        read_latents(out, [row.method for row in report.rows], progress=progress),
+    )
+    write_text(out / PAGE_FILE, _page(study))
+    return replace(report, page_file=out / PAGE_FILE)
+
+
+def _scene(out: Path) -> str | Scene:
+    """The scene of the study in ``out``: the paper's, unless its settings name another one."""
+    settings = read_json(out / RUN_FILE, "run settings") if (out / RUN_FILE).exists() else {}
+    if "scene" not in settings:
+        return T_INTERSECTION
+    scene = read_described(settings)
+    assert not isinstance(scene, OwnScene), "studies refuse other scenes"
+    return scene
+
+
+def _page(study: _Study) -> str:
+    charts: list[Chart] = []
+    sections = [
+        ("results", "Results", _results(study, charts)),
+        ("curves", "Learning curves", _curves(study, charts)),
+        ("worlds", "Other worlds and shorter trainings", _worlds(study, charts)),
+        ("player", "Episode player", _player(study)),
+        ("failures", "Failures", _failures(study)),
+        ("latents", "Latent space", _latents(study)),
+        ("making", "How it was made", _making(study)),
+    ]
+    title = f"Study {study.out.resolve().name}"
+    return Template(_static("page.html")).substitute(
+        title=escape(title),
+        summary=escape(_summary(study.rows)),
+        style=_static("page.css"),
+        contents="".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, heading, _ in sections),
+        sections="".join(section(name, heading, content) for name, heading, content in sections),
+        data=json_data("chart-data", {one.name: one.figure for one in charts}) + _data(study),
+        script="\n".join(_static(name) for name in _SCRIPTS),
+        plotly=packed("plotly", get_plotlyjs()) if charts else "",
+    )
+
+
+@cache
+def _static(name: str) -> str:
+    return (_STATIC / name).read_text(encoding="utf-8")
+
+
+def _summary(rows: Sequence[Row]) -> str:
+    methods = len({(row.method, row.origin) for row in rows})
+    seeds = max(len(row.seeds) for row in rows)
+    episodes = sum(row.episodes * len(row.seeds) for row in rows)
+    return f"{methods} methods, up to {seeds} seeds of each, {episodes:,} episodes in all."
+
+
+def _shown(one: Chart, charts: list[Chart]) -> str:
+    charts.append(one)
+    return chart(one.name, one.description, one.lines)
+
+
+def _results(study: _Study, charts: list[Chart]) -> str:
+    main = at_mixes(study.rows)
+    if not main:
+        return _left_out("no policy was tested at a single mix of drivers")
+    parts = [_shown(outcome_chart(main, outcome), charts) for outcome in ("success", "collision")]
+    for heading in ("Success by mix of drivers", "All outcomes", "Who is hit", "Differences in success"):
+        if heading in study.tables:
+            parts.append(_table(study.tables[heading]))
+    return "".join(parts)
+
+
+def _table(one: Table) -> str:
+    return f"<h3>{escape(one.heading)}</h3>" + table(one.lines, one.heading) + paragraph(one.note)
+
+
+def _curves(study: _Study, charts: list[Chart]) -> str:
+    if study.curves is None:
+        return _left_out("the study's folder has no learning curves")
+    note = "Means of the seeds, smoothed over five points; bands lead from the worst seed to the best."
+    return _shown(study.curves, charts) + paragraph(note)
+
+
+def _worlds(study: _Study, charts: list[Chart]) -> str:
+    worlds = over_all_mixes(study.rows)
+    if not worlds:
+        return _left_out("the study tested its policies in the world of their training alone")
+    shown = [_shown(one, charts) for one in world_charts(worlds)]
+    return "".join([*shown, *(_table(one) for one in study.tables.values() if one.heading.startswith("Other worlds"))])
+
+
+def _player(study: _Study) -> str:
+    if not study.recordings.policies:
+        return _left_out("none of the study's policies can be loaded") + player_notes(study.recordings)
+    return _static("player.html") + player_notes(study.recordings)
+
+
+def _failures(study: _Study) -> str:
+    if not study.recordings.policies:
+        return _left_out("no episodes were recorded")
+    return paragraph(
+        "A failure opens in the episode player. Of a collision it says which driver was hit: trait and route."
+    ) + failure_lists(study.recordings)
+
+
+def _latents(study: _Study) -> str:
+    if study.latents is None:
+        return _left_out("no method of the study infers traits with a model")
+    return _static("latents.html")
+
+
+def _making(study: _Study) -> str:
+    parts = [paragraph(f"Written by tint_sumo {tint_sumo.__version__}.")]
+    if (study.out / RUN_FILE).exists():
+        settings = read_json(study.out / RUN_FILE, "run settings")
+        lines = [["setting", "value"], *([name, value] for name, value in _flat(settings, ""))]
+        parts.append(folded("Settings of the study", table(lines, "Settings of the study")))
+    else:
+        parts.append(_left_out("the study's folder has no settings"))
+    seeds = [["method", "seeds"]]
+    seeds += [[title, ", ".join(map(str, own))] for title, own in _seeds(study.rows).items()]
+    parts.append(folded("Seeds of the trainings", table(seeds, "Seeds of the trainings")))
+    versions = _versions(study.out)
+    if versions:
+        parts.append(folded("Versions at the training", table(versions, "Versions at the training")))
+    return "".join(parts)
+
+
+def _flat(value: Any, name: str) -> Iterator[tuple[str, str]]:
+    """Names and values of nested settings."""
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            yield from _flat(part, f"{name}.{key}" if name else str(key))
+    else:
+        yield name, json.dumps(value)
+
+
+def _seeds(rows: Sequence[Row]) -> dict[str, tuple[int, ...]]:
+    return {row.title: row.seeds for row in rows}
+
+
+def _versions(out: Path) -> Lines:
+    """Versions of the packages that trained the policies; all of them where policies differ."""
+    found: dict[str, dict[str, None]] = {}
+    for file in sorted(out.glob(f"policies/*/{POLICY}.json")):
+        for package, version in read_json(file, "card of the policy").get("versions", {}).items():
+            found.setdefault(package, {})[str(version)] = None
+    return [["package", "version"], *([name, ", ".join(all_)] for name, all_ in found.items())] if found else []
+
+
+def _left_out(reason: str) -> str:
+    return paragraph(f"This section is left out: {reason}.")
+
+
+def _data(study: _Study) -> str:
+    parts = [player_data(study.recordings)] if study.recordings.policies else []
+    if study.latents is not None:
+        parts.append(packed("latent-data", json.dumps(study.latents, separators=(",", ":"))))
+    return "".join(parts)

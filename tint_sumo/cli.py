@@ -241,6 +241,8 @@ class TrainTraits(Command):
     """Standard deviation of the noise on every position in training, m."""
     seed: int = 0
     """Seed of the training, and of the split into training and test episodes."""
+    streaming: bool = False
+    """Keep the windows in a file beside the model instead of in memory, for large datasets; the model is the same."""
 
     def run(self) -> Outcome:
         from tint_sumo.job_table import one_job
@@ -252,7 +254,13 @@ class TrainTraits(Command):
         settings = replace(_TRAIT_BUDGET.full(self.budget), noise_m=self.noise)
         with one_job(Title("traits", self.method, seed=self.seed)) as report:
             card = train_traits(
-                self.data, self.out, method=self.method, settings=settings, seed=self.seed, report=report
+                self.data,
+                self.out,
+                method=self.method,
+                settings=settings,
+                seed=self.seed,
+                streaming=self.streaming,
+                report=report,
             )
         return Outcome(
             f"trained {self.method} on {card['windows']} windows: {self.out}", {**card, "out": str(self.out)}

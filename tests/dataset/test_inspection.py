@@ -108,6 +108,8 @@ def test_rows_without_a_driver(dataset: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(dataset, copy)
     file = next((copy / DRIVERS).iterdir())
-    pd.read_parquet(file).iloc[1:].to_parquet(file)
+    drivers = pd.read_parquet(file)
+    drivers.loc[0, "vehicle"] = 9999
+    drivers.to_parquet(file)
     with pytest.raises(InputError, match=r"has \d+ of \d+ rows with their drivers"):
         inspect(copy, progress=False)

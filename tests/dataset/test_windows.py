@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,16 @@ import pytest
 
 from tests.simulation.scenes import T
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, NO_LEADER_GAP_M
-from tint_sumo.dataset.recorder import record, simulate_episodes
+from tint_sumo.dataset.recorder import EPISODES_PER_SHARD, record, simulate_episodes
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, TRAJECTORY_SCHEMA
-from tint_sumo.dataset.windows import Windows, cut_windows, load_labels, load_windows, split_by_episode
+from tint_sumo.dataset.windows import (
+    Windows,
+    cut_windows,
+    load_labels,
+    load_windows,
+    read_training_windows,
+    split_by_episode,
+)
 from tint_sumo.errors import InputError
 from tint_sumo.simulation.demand import PlacedVehicle
 from tint_sumo.simulation.simulation import Simulation
@@ -61,6 +69,16 @@ def test_split_puts_every_episode_on_one_side(dataset: Path) -> None:
     assert not set(windows.episode[train]) & set(windows.episode[test])
     assert len(test) / len(windows) == pytest.approx(1 / 3, abs=0.1)
     np.testing.assert_array_equal(split_by_episode(windows, 1 / 3, seed=0)[1], test)
+
+
+def test_training_windows_come_shard_by_shard(two_shards: Path) -> None:
+    windows = load_windows(two_shards)
+    train, _ = split_by_episode(windows, 1 / 3, seed=4)
+    parts = list(read_training_windows(two_shards, 1 / 3, seed=4))
+    assert [set(part.episode // EPISODES_PER_SHARD) for part in parts] == [{0}, {1}]
+    for field in fields(Windows):
+        column = np.concatenate([getattr(part, field.name) for part in parts])
+        np.testing.assert_array_equal(column, getattr(windows[train], field.name))
 
 
 # The label leak: in the authors' code a driver without a leader got a gap that told its trait.
@@ -146,7 +164,7 @@ def test_a_damaged_shard(dataset: Path, tmp_path: Path, keep: int) -> None:
     shutil.copytree(dataset, tmp_path / "d")
     file = next((tmp_path / "d" / TRAJECTORIES).iterdir())
     file.write_bytes(file.read_bytes()[:keep])
-    with pytest.raises(InputError, match=r"trajectories is damaged .*; record the dataset anew"):
+    with pytest.raises(InputError, match=r"shard-00000.parquet is damaged .*; remove it and repeat the command"):
         load_windows(tmp_path / "d")
 
 
@@ -154,13 +172,28 @@ def test_a_missing_shard_is_noticed_and_recorded_again(dataset: Path, tmp_path: 
     shutil.copytree(dataset, tmp_path / "d")
     file = next((tmp_path / "d" / TRAJECTORIES).iterdir())
     content = file.read_bytes()
-    (tmp_path / "d" / TRAJECTORIES / "shard-00001.parquet").write_bytes(content)
-    with pytest.raises(InputError, match=r"trajectories has \d+ of \d+ rows"):
-        load_windows(tmp_path / "d")
-    (tmp_path / "d" / TRAJECTORIES / "shard-00001.parquet").unlink()
     file.unlink()
+    with pytest.raises(InputError, match=r"shard-00000.parquet is missing; repeat the command"):
+        load_windows(tmp_path / "d")
     record(tmp_path / "d", 3000, seed=1, progress=False)
     assert file.read_bytes() == content
+
+
+def test_rows_that_are_missing(dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(dataset, tmp_path / "d")
+    file = next((tmp_path / "d" / TRAJECTORIES).iterdir())
+    pd.read_parquet(file).iloc[1:].to_parquet(file)
+    with pytest.raises(InputError, match=r"trajectories has \d+ of \d+ rows; repeat the command"):
+        load_windows(tmp_path / "d")
+
+
+@pytest.mark.parametrize("more", [-1, 1])
+def test_other_windows_than_the_manifest_tells_of(dataset: Path, tmp_path: Path, more: int) -> None:
+    shutil.copytree(dataset, tmp_path / "d")
+    manifest = json.loads((tmp_path / "d" / MANIFEST).read_text())
+    (tmp_path / "d" / MANIFEST).write_text(json.dumps(manifest | {"windows": manifest["windows"] + more}))
+    with pytest.raises(InputError, match="do not agree; record the dataset anew"):
+        load_windows(tmp_path / "d")
 
 
 @pytest.mark.parametrize("key", ["rows", "seed"])
@@ -177,7 +210,7 @@ def test_missing_labels(dataset: Path, tmp_path: Path) -> None:
     shutil.copytree(dataset, tmp_path / "d")
     windows = load_windows(dataset)
     shutil.rmtree(tmp_path / "d" / DRIVERS)
-    with pytest.raises(InputError, match=r"drivers is missing; record the dataset anew"):
+    with pytest.raises(InputError, match=r"drivers.shard-00000.parquet is missing; repeat the command"):
         load_labels(tmp_path / "d", windows)
 
 

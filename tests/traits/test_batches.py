@@ -8,14 +8,19 @@ from tint_sumo.traits.batches import Siblings, TrainingWindows, WindowBatch, add
 
 
 def test_siblings_are_all_the_other_windows_of_the_driver():
-    driver = torch.tensor([7, 3, 7, 9, 3, 7])
+    driver = torch.tensor([7, 7, 7, 3, 3, 9])
     siblings = Siblings(driver)
     generator = torch.Generator().manual_seed(0)
     seen = {window: set() for window in range(6)}
     for _ in range(100):
         for window, other in enumerate(siblings.draw(torch.arange(6), generator).tolist()):
             seen[window].add(other)
-    assert seen == {0: {2, 5}, 2: {0, 5}, 5: {0, 2}, 1: {4}, 4: {1}, 3: {3}}
+    assert seen == {0: {1, 2}, 1: {0, 2}, 2: {0, 1}, 3: {4}, 4: {3}, 5: {5}}
+
+
+def test_a_driver_whose_windows_are_scattered_is_refused():
+    with pytest.raises(ValueError, match="all windows of a driver must stand in a row"):
+        Siblings(torch.tensor([7, 3, 7]))
 
 
 def test_a_batch_holds_another_window_of_each_driver(street):

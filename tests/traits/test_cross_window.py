@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from tint_sumo.traits.batches import TrainingWindows
 from tint_sumo.traits.cross_window import CrossWindow, fuse
 from tint_sumo.traits.evaluation import encode_windows
 from tint_sumo.traits.training import train
@@ -18,7 +19,7 @@ def model(small, street) -> CrossWindow:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = CrossWindow(small)
-    model.fit_features(torch.from_numpy(windows.states), torch.from_numpy(windows.length))
+    model.fit_features(TrainingWindows(windows).parts())
     return model.eval()
 
 

@@ -16,7 +16,7 @@ def model(request, small, street) -> TraitModel:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = TRAIT_METHODS[request.param](small)
-    model.fit_features(torch.from_numpy(windows.states), torch.from_numpy(windows.length))
+    model.fit_features(TrainingWindows(windows).parts())
     return model.eval()
 
 

@@ -22,7 +22,7 @@ def model(small, batch) -> Vae:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = Vae(small)
-    model.fit_features(*batch)
+    model.fit_features([WindowBatch(*batch)])
     return model.eval()
 
 
@@ -40,7 +40,7 @@ def test_steps_after_the_length_have_no_influence(model, batch, rubbish):
         assert torch.equal(clean, dirty)
     assert loss_terms(model, states, length) == loss_terms(model, spoilt, length)
     refitted = Vae(model.settings)
-    refitted.fit_features(spoilt, length)
+    refitted.fit_features([WindowBatch(spoilt, length)])
     assert torch.equal(refitted.feature_scale, model.feature_scale)
 
 

@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, read_shard, shard_file
+from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, read_shards
 from tint_sumo.dataset.windows import drivers_of, own_vtypes, read_manifest
 from tint_sumo.errors import InputError
 from tint_sumo.files import whole_file
@@ -154,12 +154,12 @@ def _colours(manifest: Mapping[str, Any]) -> dict[str, Colour]:
 
 def _shards(folder: Path, manifest: Mapping[str, Any], progress: bool) -> Iterator[pd.DataFrame]:
     """Rows of each shard with their drivers' traits."""
-    columns = [*_KEYS, "time_s", "speed_mps", "gap_m"]
-    shards = int(manifest.get("shards", 0))
-    with make_bar(total=shards, desc="inspect", unit="shard", disable=not progress) as bar:
-        for shard in range(shards):
-            rows = read_shard(shard_file(folder, TRAJECTORIES, shard), columns)
-            drivers = read_shard(shard_file(folder, DRIVERS, shard), [*_KEYS, "trait"])
+    tables = (
+        read_shards(folder, TRAJECTORIES, manifest, [*_KEYS, "time_s", "speed_mps", "gap_m"]),
+        read_shards(folder, DRIVERS, manifest, [*_KEYS, "trait"]),
+    )
+    with make_bar(total=manifest["shards"], desc="inspect", unit="shard", disable=not progress) as bar:
+        for rows, drivers in zip(*tables, strict=True):
             yield rows.merge(drivers, on=_KEYS)
             bar.update()
 

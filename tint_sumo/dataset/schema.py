@@ -5,9 +5,10 @@ driver, with the trait label), each one Parquet file per shard, and ``manifest.j
 for, tells the trajectories once more, as SUMO does.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pyarrow as pa
@@ -22,6 +23,7 @@ DRIVERS = "drivers"
 TABLES = (TRAJECTORIES, DRIVERS)
 FCD = "fcd"
 _SUFFIX = {TRAJECTORIES: "parquet", DRIVERS: "parquet", FCD: "xml.gz"}
+_ROWS_KEY = {TRAJECTORIES: "rows", DRIVERS: "drivers"}  # of a table in the manifest
 
 
 def _field(name: str, dtype: pa.DataType, unit: str, meaning: str, nullable: bool = False) -> pa.Field:
@@ -65,6 +67,23 @@ def shard_file(folder: Path, part: str, shard: int) -> Path:
 def shard_number(file: Path) -> int:
     """Of a path made by ``shard_file``."""
     return int(file.name.removeprefix("shard-").split(".")[0])
+
+
+def read_shards(
+    folder: Path, part: str, manifest: Mapping[str, Any], columns: list[str] | None = None
+) -> Iterator[pd.DataFrame]:
+    """The rows of a dataset's table, shard after shard.
+
+    Raises:
+        InputError: a file is missing or damaged, or there are more or fewer rows than the manifest tells of.
+    """
+    found, wanted = 0, manifest[_ROWS_KEY[part]]
+    for shard in range(manifest["shards"]):
+        rows = read_shard(shard_file(folder, part, shard), columns)
+        found += len(rows)
+        yield rows
+    if found != wanted:
+        raise InputError(f"{folder / part} has {found} of {wanted} rows; repeat the command that recorded the dataset")
 
 
 def read_shard(file: Path, columns: list[str] | None = None) -> pd.DataFrame:

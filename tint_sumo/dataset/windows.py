@@ -1,26 +1,37 @@
 """Windows of up to 20 steps for learning traits, from a recorded dataset. Labels are loaded apart."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, WINDOW_STEPS, Population
-from tint_sumo.dataset.schema import DRIVERS, MANIFEST, SCHEMA_VERSION, TRAJECTORIES
+from tint_sumo.dataset.schema import DRIVERS, MANIFEST, SCHEMA_VERSION, TRAJECTORIES, read_shards
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
 
 _DRIVERS_PER_EPISODE = 100_000
-_MANIFEST_KEYS = ("rows", "drivers", "windows", "seed", "scene", "scene_digest", "p_conservative", "population")
+_MANIFEST_KEYS = (
+    "rows",
+    "drivers",
+    "windows",
+    "shards",
+    "seed",
+    "scene",
+    "scene_digest",
+    "p_conservative",
+    "population",
+)
+PART = 10_000  # windows that are worked on at a time
 
 
 @dataclass(frozen=True)
 class Windows:
-    """N windows of the states x of paper III-B; nothing in them tells the label.
+    """N windows of the states x of paper III-B, those of a driver in a row; nothing in them tells the label.
 
     A state is the offset from the window's first position and the gap to the leader, in m; zero after ``length``.
     """
@@ -38,19 +49,72 @@ class Windows:
         """The windows at these indices."""
         return type(self)(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
+    def parts(self) -> Iterator[Self]:
+        """All windows in their order, some thousands at a time."""
+        for start in range(0, len(self), PART):
+            yield self[start : start + PART]
+
+
+class OfDrivers(Protocol):
+    """What tells the driver of each of N windows."""
+
+    @property
+    def driver(self) -> NDArray[np.int64]:
+        """(N,) as in ``Windows``."""
+
 
 def load_windows(folder: Path) -> Windows:
-    """Cut every recorded track into windows of 20 steps; a remainder of at least 2 steps is a shorter window.
+    """All windows of a dataset: every recorded track is cut into windows of 20 steps, and a remainder of at least 2.
+
+    Raises:
+        InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
+    """
+    count = read_manifest(folder)["windows"]
+    whole = Windows(
+        np.empty((count, WINDOW_STEPS, 2), np.float32),
+        np.empty(count, np.int64),
+        np.empty(count, np.int64),
+        np.empty(count, np.int64),
+        np.empty(count, np.bool_),
+    )
+    done = 0
+    for part in read_windows(folder):
+        for field in fields(Windows):
+            getattr(whole, field.name)[done : done + len(part)] = getattr(part, field.name)
+        done += len(part)
+    return whole
+
+
+def read_windows(folder: Path) -> Iterator[Windows]:
+    """The windows of a dataset, shard after shard; all windows of an episode are in one shard.
 
     Raises:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
     """
     manifest = read_manifest(folder)
-    columns = ["episode", "vehicle", "position_m", "gap_m"]
-    rows = _read(folder, TRAJECTORIES, columns, manifest["rows"])  # sorted by episode, vehicle and time
-    return cut_windows(
-        _driver_numbers(rows), rows["episode"].to_numpy(), rows["position_m"].to_numpy(), rows["gap_m"].to_numpy()
-    )
+    missing = manifest["windows"]
+    for rows in read_shards(folder, TRAJECTORIES, manifest, ["episode", "vehicle", "position_m", "gap_m"]):
+        windows = cut_windows(  # rows are sorted by episode, vehicle and time
+            _driver_numbers(rows), rows["episode"].to_numpy(), rows["position_m"].to_numpy(), rows["gap_m"].to_numpy()
+        )
+        missing -= len(windows)
+        if missing < 0:
+            break
+        yield windows
+    if missing != 0:
+        raise InputError(f"{folder / TRAJECTORIES} and {folder / MANIFEST} do not agree; record the dataset anew")
+
+
+def read_training_windows(folder: Path, test_fraction: float, seed: int) -> Iterator[Windows]:
+    """The training windows of ``split_by_episode``, shard after shard.
+
+    Raises:
+        InputError: as ``read_windows``.
+    """
+    episode = np.concatenate([np.unique(part.episode) for part in read_windows(folder)])
+    test = episodes_to_test(episode, test_fraction, seed)
+    for part in read_windows(folder):
+        yield part[~np.isin(part.episode, test)]
 
 
 def cut_windows(
@@ -92,7 +156,7 @@ def steps_in_window(driver: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray((np.arange(len(driver)) - track_start) % WINDOW_STEPS)
 
 
-def load_labels(folder: Path, windows: Windows) -> NDArray[np.int64]:
+def load_labels(folder: Path, windows: OfDrivers) -> NDArray[np.int64]:
     """Number of each window's driver's profile in its population; (N,). Never an input of a method without labels.
 
     In a dataset of one's own SUMO configuration: numbers of the drivers' vTypes in their sorted order.
@@ -102,8 +166,8 @@ def load_labels(folder: Path, windows: Windows) -> NDArray[np.int64]:
     """
     manifest = read_manifest(folder)
     names = own_vtypes(manifest) or [profile.name for profile in drivers_of(manifest).profiles]
-    trait = load_drivers(folder, windows, ["trait"])["trait"].astype(str)
-    return pd.Index(names).get_indexer(pd.Index(trait)).astype(np.int64)
+    drivers, row = _drivers(folder, windows, ["trait"])
+    return pd.Index(names).get_indexer(pd.Index(drivers["trait"].astype(str))).astype(np.int64)[row]
 
 
 def own_vtypes(manifest: Mapping[str, Any]) -> list[str] | None:
@@ -117,26 +181,35 @@ def drivers_of(manifest: Mapping[str, Any]) -> Population:
     return Population.from_file(manifest["population"], ("population",))
 
 
-def load_drivers(folder: Path, windows: Windows, columns: Sequence[str]) -> pd.DataFrame:
+def load_drivers(folder: Path, windows: OfDrivers, columns: Sequence[str]) -> pd.DataFrame:
     """Columns of the label file, such as ``desired_speed_mps``, a row for each window's driver.
 
     Raises:
         InputError: the labels are missing or do not belong to these windows.
     """
-    rows = _read(folder, DRIVERS, ["episode", "vehicle", *columns], read_manifest(folder)["drivers"])
+    drivers, row = _drivers(folder, windows, columns)
+    return drivers.iloc[row].reset_index(drop=True)
+
+
+def _drivers(folder: Path, windows: OfDrivers, columns: Sequence[str]) -> tuple[pd.DataFrame, NDArray[np.intp]]:
+    """Columns of the label file, a row for each driver, and the row of each window's driver."""
+    rows = pd.concat(read_shards(folder, DRIVERS, read_manifest(folder), ["episode", "vehicle", *columns]))
     row = pd.Index(_driver_numbers(rows)).get_indexer(pd.Index(windows.driver))
     if (row < 0).any():
         raise InputError(f"{folder / DRIVERS} lacks drivers of these windows; record the dataset anew")
-    return rows[list(columns)].iloc[row].reset_index(drop=True)
+    return rows[list(columns)], row
 
 
 def split_by_episode(windows: Windows, test_fraction: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Indices of training and test windows; no episode, hence no driver, stands on both sides."""
-    episodes = np.unique(windows.episode)
-    shuffled = np.random.default_rng(seed).permutation(episodes)
-    test = shuffled[: round(test_fraction * len(episodes))]
-    in_test = np.isin(windows.episode, test)
+    in_test = np.isin(windows.episode, episodes_to_test(windows.episode, test_fraction, seed))
     return np.flatnonzero(~in_test), np.flatnonzero(in_test)
+
+
+def episodes_to_test(episode: NDArray[np.int64], test_fraction: float, seed: int) -> NDArray[np.int64]:
+    """Which of these episodes, each named once or more often, are for tests."""
+    episodes = np.unique(episode)
+    return np.random.default_rng(seed).permutation(episodes)[: round(test_fraction * len(episodes))]
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -151,30 +224,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise InputError(
             f"{folder} has dataset schema version {found}, this tint_sumo reads {SCHEMA_VERSION}; record it anew"
         )
-    missing = [
-        key
-        for key in ("rows", "drivers", "windows", "seed", "scene", "scene_digest", "p_conservative", "population")
-        if key not in manifest
-    ]
+    missing = [key for key in _MANIFEST_KEYS if key not in manifest]
     if missing:
         raise InputError(f"{folder / MANIFEST} is damaged (no {', '.join(missing)}); record the dataset anew")
     return manifest
-
-
-def _read(folder: Path, part: str, columns: list[str], wanted: int) -> pd.DataFrame:
-    """Columns of all shards, which must have the wanted number of rows."""
-    try:
-        rows = pd.read_parquet(folder / part, columns=columns)
-    except FileNotFoundError:
-        raise InputError(f"{folder / part} is missing; record the dataset anew") from None
-    except (OSError, ValueError, KeyError) as error:  # pyarrow's own errors derive from these
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{folder / part} is damaged ({reason}); record the dataset anew") from None
-    if len(rows) != wanted:
-        raise InputError(
-            f"{folder / part} has {len(rows)} of {wanted} rows; repeat the command that recorded the dataset"
-        )
-    return rows
 
 
 def _driver_numbers(rows: pd.DataFrame) -> NDArray[np.int64]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tint_sumo import traits
 from tint_sumo.config import CONSERVATIVE_LABEL, LATENT_SIZE, TraitSettings
+from tint_sumo.dataset.window_file import WindowFile, window_file
 from tint_sumo.dataset.windows import (
     Windows,
     drivers_of,
@@ -16,6 +17,7 @@ from tint_sumo.dataset.windows import (
     load_windows,
     own_vtypes,
     read_manifest,
+    read_training_windows,
     split_by_episode,
 )
 from tint_sumo.errors import InputError
@@ -29,7 +31,14 @@ from tint_sumo.traits.vae import Vae
 
 
 def train_traits(
-    data: Path, out: Path, *, method: str = "vae", settings: TraitSettings, seed: int = 0, report: Report = silent
+    data: Path,
+    out: Path,
+    *,
+    method: str = "vae",
+    settings: TraitSettings,
+    seed: int = 0,
+    streaming: bool = False,
+    report: Report = silent,
 ) -> dict[str, Any]:
     """Train a trait model on two thirds of a dataset's episodes (paper IV-B) and return its card.
 
@@ -39,14 +48,21 @@ def train_traits(
         method: a name in ``tint_sumo.traits.TRAIT_METHODS``.
         settings: sizes, loss weights and schedule.
         seed: of weights, order and noise, and of the split into training and test episodes.
+        streaming: keep the windows in a file beside the model instead of in memory; the model is the same.
         report: told of the progress.
 
     Raises:
-        InputError: no such method, no usable dataset, a negative seed, or ``out`` holds another run.
+        InputError: no such method, no usable dataset, a negative seed, no room for the file, or ``out`` holds another
+            run.
     """
     if seed < 0:
         raise InputError(f"seed must not be negative: {seed}")
-    train_on_split(data, load_windows(data), out, method=method, settings=settings, seed=seed, report=report)
+    find_trait_method(method)
+    if streaming:
+        with window_file(read_training_windows(data, TEST_FRACTION, seed), out) as windows:
+            _train(data, windows, out, method=method, settings=settings, seed=seed, report=report)
+    else:
+        train_on_split(data, load_windows(data), out, method=method, settings=settings, seed=seed, report=report)
     return read_card(out / "model.safetensors")
 
 
@@ -63,15 +79,39 @@ def train_on_split(
 ) -> traits.TraitModel:
     """``train_traits`` on all ``windows`` of the dataset ``data``, loaded before; the trained model."""
     chosen, _ = split_by_episode(windows, TEST_FRACTION, seed)
+    return _train(
+        data,
+        windows[chosen],
+        out,
+        method=method,
+        settings=settings,
+        seed=seed,
+        latent_size=latent_size,
+        report=report,
+    )
+
+
+def _train(
+    data: Path,
+    windows: Windows | WindowFile,
+    out: Path,
+    *,
+    method: str,
+    settings: TraitSettings,
+    seed: int,
+    latent_size: int = LATENT_SIZE,
+    report: Report,
+) -> traits.TraitModel:
+    """Train on all of ``windows``, which are of the dataset ``data``."""
     uses_labels = find_trait_method(method).uses_labels
     return train(
-        windows[chosen],
+        windows,
         settings,
         out,
         method=method,
         seed=seed,
         latent_size=latent_size,
-        conservative=_first_of_two(load_labels(data, windows)[chosen], method) if uses_labels else None,
+        conservative=_first_of_two(load_labels(data, windows), method) if uses_labels else None,
         report=report,
         card={"data": describe(data)},
     )

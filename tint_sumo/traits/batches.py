@@ -1,11 +1,13 @@
 """Training windows as tensors: batches, other windows of the same driver, and noise on measured positions."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from tint_sumo.config import NO_LEADER_GAP_M
+from tint_sumo.dataset.window_file import WindowFile
 from tint_sumo.dataset.windows import Windows
 
 
@@ -30,11 +32,20 @@ class WindowBatch:
 class TrainingWindows:
     """All windows of a training run; ``conservative`` is None for methods that learn without labels."""
 
-    def __init__(self, windows: Windows, conservative: Tensor | None = None, *, with_other: bool = False) -> None:
-        self.states = torch.from_numpy(windows.states)
-        self.length = torch.from_numpy(windows.length)
+    def __init__(
+        self, windows: Windows | WindowFile, conservative: Tensor | None = None, *, with_other: bool = False
+    ) -> None:
+        self._windows = windows
         self._conservative = conservative
         self._siblings = Siblings(torch.from_numpy(windows.driver)) if with_other else None
+
+    def __len__(self) -> int:
+        return len(self._windows)
+
+    def parts(self) -> Iterator[WindowBatch]:
+        """All windows in their order, some thousands at a time."""
+        for part in self._windows.parts():
+            yield _batch(part)
 
     def batch(self, index: Tensor, generator: torch.Generator) -> WindowBatch:
         """The windows (N,) at ``index``, beside others that ``generator`` chooses."""
@@ -42,27 +53,32 @@ class TrainingWindows:
         other = None
         if self._siblings is not None:
             chosen = self._siblings.draw(index, generator)
-            other = WindowBatch(self.states[chosen], self.length[chosen])
-        return WindowBatch(self.states[index], self.length[index], other, labels)
+            other = _batch(self._windows[chosen.numpy()])
+        return replace(_batch(self._windows[index.numpy()]), other=other, conservative=labels)
+
+
+def _batch(windows: Windows) -> WindowBatch:
+    return WindowBatch(torch.from_numpy(windows.states), torch.from_numpy(windows.length))
 
 
 class Siblings:
-    """For each window the other windows of its driver."""
+    """For each window the other windows of its driver; ``driver`` (N,) numbers the drivers, each one's in a row."""
 
     def __init__(self, driver: Tensor) -> None:
-        self._sorted = torch.argsort(driver, stable=True)  # windows, driver by driver
-        _, inverse, count = torch.unique(driver, return_inverse=True, return_counts=True)
-        self._count = count[inverse]
-        self._first = (count.cumsum(0) - count)[inverse]  # position of a driver's first window
-        self._rank = torch.empty_like(self._sorted)  # number of a window among those of its driver
-        self._rank[self._sorted] = torch.arange(len(driver))
-        self._rank -= self._first
+        found, count = torch.unique_consecutive(driver, return_counts=True)
+        if len(found.unique()) < len(found):
+            raise ValueError("all windows of a driver must stand in a row")
+        self._end = count.cumsum(0)  # (D,) of each driver's windows
 
     def draw(self, index: Tensor, generator: torch.Generator) -> Tensor:
         """For each window one of its driver's others at random, or itself if there is none."""
-        count = self._count[index]
+        driver = torch.searchsorted(self._end, index, right=True)
+        end = self._end[driver]
+        first = torch.where(driver > 0, self._end[driver - 1], 0)
+        count = end - first
         step = 1 + (torch.rand(len(index), generator=generator) * (count - 1)).long()
-        return self._sorted[self._first[index] + (self._rank[index] + step) % count]
+        chosen: Tensor = first + (index - first + step) % count
+        return chosen
 
 
 def add_position_noise(states: Tensor, noise_m: float, generator: torch.Generator) -> Tensor:

@@ -1,6 +1,8 @@
 """What every trait representation offers, and the registry of methods."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -65,14 +67,16 @@ class TraitModel(nn.Module, ABC):
         """Features (N, T, F) before they are scaled."""
         return displacement_and_gap(states)
 
-    def fit_features(self, states: Tensor, length: Tensor) -> None:
+    def fit_features(self, parts: Iterable[WindowBatch]) -> None:
         """Set the scaling from training windows."""
-        raw, valid = self.raw_features(states).double(), valid_steps(states, length)
-        for feature, (spread, undefined) in enumerate(zip(self.feature_spread, self.undefined_steps, strict=True)):
-            values = raw[:, undefined:, feature][valid[:, undefined:]]
-            std = values.std(correction=0) if len(values) else torch.zeros(())
-            self.feature_mean[feature] = values.mean() if len(values) else 0.0
-            self.feature_scale[feature] = (std if std >= SMALLEST_STD else 1.0) / spread
+        found = [Moments()] * len(self.feature_spread)
+        for part in parts:
+            raw, valid = self.raw_features(part.states).double(), valid_steps(part.states, part.length)
+            for feature, undefined in enumerate(self.undefined_steps):
+                found[feature] += Moments.of(raw[:, undefined:, feature][valid[:, undefined:]])
+        for feature, (spread, moments) in enumerate(zip(self.feature_spread, found, strict=True)):
+            self.feature_mean[feature] = moments.mean
+            self.feature_scale[feature] = (moments.std if moments.std >= SMALLEST_STD else 1.0) / spread
 
     def features(self, states: Tensor, length: Tensor) -> Tensor:
         """Scaled features (N, T, F), zero after ``length`` and where they are unknown."""
@@ -82,6 +86,39 @@ class TraitModel(nn.Module, ABC):
         for feature, steps in enumerate(self.undefined_steps):
             features[:, :steps, feature] = 0.0
         return features
+
+
+@dataclass(frozen=True)
+class Moments:
+    """What is needed of some numbers for their mean and standard deviation together with others."""
+
+    count: int = 0
+    mean: float = 0.0
+    squares: float = 0.0  # sum of squared differences from the mean
+
+    @classmethod
+    def of(cls, values: Tensor) -> "Moments":
+        """Of values (N,)."""
+        if len(values) == 0:
+            return cls()
+        mean = values.mean()
+        return cls(len(values), float(mean), float((values - mean).square().sum()))
+
+    def __add__(self, other: "Moments") -> "Moments":
+        count = self.count + other.count
+        if count == 0:
+            return self
+        share, apart = other.count / count, other.mean - self.mean
+        return Moments(
+            count,
+            self.mean + share * apart,
+            self.squares + other.squares + self.count * share * apart**2,
+        )
+
+    @property
+    def std(self) -> float:
+        """Standard deviation; 0 of no numbers."""
+        return (self.squares / self.count) ** 0.5 if self.count else 0.0
 
 
 def displacement_and_gap(states: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from tint_sumo.config import LATENT_SIZE, TraitSettings
+from tint_sumo.dataset.window_file import WindowFile
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file
@@ -28,7 +29,7 @@ BFLOAT16_HIDDEN_SIZE = 64  # from this size on bfloat16 is the faster one on CPU
 
 
 def train(
-    windows: Windows,
+    windows: Windows | WindowFile,
     settings: TraitSettings,
     out: Path,
     *,
@@ -62,7 +63,7 @@ def train(
         InputError: unknown method, no windows, ``out`` holds another run, or its checkpoint is damaged.
     """
     model_type = find_trait_method(method)
-    if len(windows.length) == 0:
+    if len(windows) == 0:
         raise InputError("there are no windows to train on; record a dataset with more of them")
     if model_type.uses_labels is not (conservative is not None):
         raise ValueError(f"labels are for the methods that learn with them: {method}.uses_labels")
@@ -72,7 +73,7 @@ def train(
         "seed": seed,
         "latent_size": latent_size,
         "settings": asdict(settings),
-        "windows": len(windows.length),
+        "windows": len(windows),
         "windows_sha256": _digest(windows),
     }
     with claim_folder(out, identity):
@@ -109,9 +110,8 @@ class _Run:
 
         Each epoch draws from a generator of its own, so a checkpoint needs no generator states.
         """
-        everything = WindowBatch(self.data.states, self.data.length)
-        measured = everything.with_noise(self.settings.noise_m, self._generator(0))
-        self.model.fit_features(measured.states, measured.length)
+        generator = self._generator(0)
+        self.model.fit_features(part.with_noise(self.settings.noise_m, generator) for part in self.data.parts())
         done, loss = self._resume(checkpoint)
         saved_at = time.monotonic()
         report(self._progress(done, 0, loss))
@@ -124,14 +124,14 @@ class _Run:
 
     def _progress(self, epoch: int, windows: int, loss: Mapping[str, float]) -> Progress:
         """After some windows of an epoch, of which that is the loss."""
-        every = len(self.data.length)
+        every = len(self.data)
         measures = {"loss": loss["total"]} if loss else {}
         return Progress(epoch * every + windows, self.settings.epochs * every, "window", measures)
 
     def _run_epoch(self, epoch: int, report: Report) -> dict[str, float]:
         """One pass over the shuffled windows; the mean of each loss term over the batches."""
         generator = self._generator(1 + epoch)
-        order = torch.randperm(len(self.data.length), generator=generator)
+        order = torch.randperm(len(self.data), generator=generator)
         starts = range(0, len(order), self.settings.batch_size)
         sums: dict[str, float] = {}
         for number, start in enumerate(starts):
@@ -186,7 +186,9 @@ def _stream_seed(seed: int, stream: int) -> int:
     return int(np.random.SeedSequence((seed, stream)).generate_state(1)[0])
 
 
-def _digest(windows: Windows) -> str:
-    digest = hashlib.sha256(np.ascontiguousarray(windows.states).tobytes())
-    digest.update(np.ascontiguousarray(windows.length).tobytes())
+def _digest(windows: Windows | WindowFile) -> str:
+    digest = hashlib.sha256()
+    for column in ("states", "length"):
+        for part in windows.parts():
+            digest.update(np.ascontiguousarray(getattr(part, column)).data)
     return digest.hexdigest()

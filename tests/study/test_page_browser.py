@@ -179,6 +179,10 @@ def test_every_button_and_key_moves_both_policies_through_the_same_case(opened: 
     assert {opened.facts(pane)["outcome"] for pane in (0, 1)} <= {"success", "timeout", "collision"}
     status = opened.text("#player-status")
     assert status.startswith("always go: time ") and "time to collision: time " in status
+    pictures = page.locator(".pane > svg")
+    assert pictures.nth(0).is_visible() and pictures.nth(1).is_visible()
+    choose(opened, "always_go", "0")
+    assert pictures.nth(0).is_visible() and not pictures.nth(1).is_visible()
 
 
 def test_it_plays_only_when_told_and_at_the_chosen_speed(browser: Any, study: Path) -> None:

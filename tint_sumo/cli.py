@@ -407,6 +407,7 @@ class TrainPolicy(Command):
         from tint_sumo.scenes import OwnScene
         from tint_sumo.standings import Title
         from tint_sumo.study.training import train_policy
+        from tint_sumo.study.training_films import film_policy
 
         _use_one_thread()
         is_own = isinstance(self.scene, OwnScene) and self.p_conservative == TrainPolicy.p_conservative
@@ -426,6 +427,7 @@ class TrainPolicy(Command):
                 traits=self.traits,
                 other_scene=self.other_scene,
                 with_zip=self.zip,
+                film=film_policy,
                 report=report,
             )
         content = {"model": str(policy), "method": self.method, "p_conservative": self.p_conservative}

@@ -5,15 +5,15 @@ import hashlib
 import io
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import safetensors.torch
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -23,7 +23,7 @@ from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file, write_text
 from tint_sumo.policy import GruPolicy, RecurrentPPO
-from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy
+from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
 from tint_sumo.policy.venv import policy_venv
 from tint_sumo.progress import Progress, Report, silent
 from tint_sumo.provenance import versions
@@ -31,8 +31,11 @@ from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnSc
 from tint_sumo.study.budgets import SNAPSHOTS_PERCENT
 from tint_sumo.study.evaluation import CASE_SEED, require_seed
 from tint_sumo.study.methods import Learned, find_learned
+from tint_sumo.training_log import log_film, open_log
 from tint_sumo.traits import TraitModel
 from tint_sumo.traits.storage import read_card, require_scene, save
+
+FilmMaker = Callable[[Path], bytes | None]  # a GIF of the policy in a file; None where there can be none
 
 CHECKPOINT_FILE = "checkpoint.zip"
 CHECKPOINT_INTERVAL_S = 15.0
@@ -60,6 +63,7 @@ def train_policy(
     traits: str | Path | None = None,
     other_scene: bool = False,
     with_zip: bool = False,
+    film: FilmMaker | None = None,
     report: Report = silent,
 ) -> Path:
     """Train a policy and write it as policy.safetensors with its card policy.json.
@@ -80,6 +84,8 @@ def train_policy(
         traits: trait model by name or path, for methods that infer traits; the shipped one if not given.
         other_scene: take a trait model that was trained in another scene, too.
         with_zip: write the policy as Stable-Baselines3's policy.zip, too.
+        film: makes a GIF of the policy in a file, for the TensorBoard log, such as
+            ``tint_sumo.study.training_films.film_policy``; called with each of the kept policies.
         report: told of the progress.
 
     Returns:
@@ -118,12 +124,13 @@ def train_policy(
             card = _card(identity, encoder)
             venv = training_venv(learned, encoder, p_conservative, settings, scene)
             try:
-                model = _learn(venv, steps, seed, out, settings, card, report)
+                model = _learn(venv, steps, seed, out, settings, card, film, report)
             finally:
                 venv.close()
             if with_zip:
                 model.save(out / ZIP_FILE)
             save_policy(model.policy, stem, card)
+            _log_film(model, stem, film)
             (out / CHECKPOINT_FILE).unlink(missing_ok=True)
         return stem.with_suffix(".safetensors")
 
@@ -205,25 +212,34 @@ def _learn(
     out: Path,
     settings: PpoSettings,
     card: Mapping[str, Any],
+    film: FilmMaker | None,
     report: Report,
 ) -> RecurrentPPO:
     """Train from the checkpoint, if there is one, to ``steps``."""
     checkpoint = out / CHECKPOINT_FILE
     model = RecurrentPPO.load(checkpoint, env=venv) if checkpoint.exists() else new_model(venv, seed, settings)
     done = model.num_timesteps
+    told = {key: card[key] for key in ("method", "p_conservative", "scene", "seed", "steps", "settings")}
+    model.set_logger(open_log(out, told, [f"rollout/{outcome}" for outcome in OUTCOMES], done))
     if done < steps:
-        model.set_logger(configure(str(out / "tensorboard"), ["tensorboard"]))
         if done:  # loading has set the random streams back to their beginning
             model.set_random_seed(_training_seed(seed, done))
         venv.seed(_training_seed(seed, done))
         report(Progress(done, steps, "step"))
-        watch = _Watch(out, steps, card, report)
+        watch = _Watch(out, steps, card, film, report)
         try:
             model.learn(steps - done, callback=watch, reset_num_timesteps=False)
         except KeyboardInterrupt:
             watch.write_checkpoint()
             raise
     return model
+
+
+def _log_film(model: BaseAlgorithm, stem: Path, film: FilmMaker | None) -> None:
+    """Log a film of the policy that has just been kept."""
+    gif = None if film is None else film(weights_file(stem))
+    if gif is not None:
+        log_film(model.logger, "film", gif, model.num_timesteps)
 
 
 def new_model(venv: VecEnv, seed: int, settings: PpoSettings) -> RecurrentPPO:
@@ -256,11 +272,19 @@ class _Watch(BaseCallback):
     A checkpoint is the state between two rollouts: within one, steps are counted from which nothing is learnt yet.
     """
 
-    def __init__(self, out: Path, steps: int, card: Mapping[str, Any], report: Report) -> None:
+    def __init__(
+        self,
+        out: Path,
+        steps: int,
+        card: Mapping[str, Any],
+        film: FilmMaker | None,
+        report: Report,
+    ) -> None:
         super().__init__()
         self._out = out
         self._steps = steps
         self._card = card
+        self._film = film
         self._report = report
         self._recent: deque[str] = deque(maxlen=RECENT_EPISODES)
         self._saved_at = time.monotonic()
@@ -287,6 +311,7 @@ class _Watch(BaseCallback):
             if self.num_timesteps * 100 >= percent * self._steps and not card_file(stem).exists():
                 assert isinstance(self.model.policy, GruPolicy)
                 save_policy(self.model.policy, stem, {**self._card, "decisions": self.num_timesteps})
+                _log_film(self.model, stem, self._film)
 
     def write_checkpoint(self) -> None:
         """Write the state at the start of the present rollout, if there is one."""

@@ -18,6 +18,7 @@ from tint_sumo.dataset.windows import Windows
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file
 from tint_sumo.progress import Progress, Report, silent
+from tint_sumo.training_log import open_log
 from tint_sumo.traits.batches import TrainingWindows, WindowBatch
 from tint_sumo.traits.model import TraitModel, find_trait_method
 from tint_sumo.traits.storage import RUN_MODEL, load, save
@@ -85,7 +86,7 @@ def train(
         labels = None if conservative is None else torch.from_numpy(conservative)
         data = TrainingWindows(windows, labels, with_other=model_type.uses_other_window)
         run = _Run(model, data, settings, seed)
-        loss = run.fit(out / CHECKPOINT_FILE, report)
+        loss = run.fit(out, report)
 
         known = {key: identity[key] for key in ("seed", "windows", "windows_sha256")}
         save(model, out / RUN_MODEL, {**known, "loss": loss, **(card or {})})
@@ -105,21 +106,28 @@ class _Run:
             model.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
         )
 
-    def fit(self, checkpoint: Path, report: Report) -> dict[str, float]:
-        """Run all epochs, beginning after those in ``checkpoint``; the mean loss terms of the last epoch.
+    def fit(self, out: Path, report: Report) -> dict[str, float]:
+        """Run all epochs, beginning after those in the checkpoint in ``out``; the mean loss terms of the last epoch.
 
         Each epoch draws from a generator of its own, so a checkpoint needs no generator states.
         """
         generator = self._generator(0)
         self.model.fit_features(part.with_noise(self.settings.noise_m, generator) for part in self.data.parts())
+        checkpoint = out / CHECKPOINT_FILE
         done, loss = self._resume(checkpoint)
+        settings = {"method": self.model.method, "seed": self.seed, **asdict(self.settings)}
+        log = open_log(out, settings, ["loss/total"], done)
         saved_at = time.monotonic()
         report(self._progress(done, 0, loss))
         for epoch in range(done, self.settings.epochs):
             loss = self._run_epoch(epoch, report)
+            for name, value in loss.items():
+                log.record(f"loss/{name}", value)
+            log.dump(epoch + 1)
             if time.monotonic() - saved_at >= CHECKPOINT_INTERVAL_S:
                 self._write_checkpoint(checkpoint, epoch + 1, loss)
                 saved_at = time.monotonic()
+        log.close()
         return loss
 
     def _progress(self, epoch: int, windows: int, loss: Mapping[str, float]) -> Progress:

@@ -1,0 +1,28 @@
+"""Films of a training's policies for its TensorBoard log."""
+
+import tempfile
+from pathlib import Path
+
+from tint_sumo.errors import InputError
+from tint_sumo.policy.storage import read_policy_card
+from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION
+from tint_sumo.study.film import render_case
+from tint_sumo.study.loading import load_policy
+
+CASE = 1  # always the same one, which no policy is trained on
+
+
+def film_policy(policy: Path) -> bytes | None:
+    """A GIF of the policy in this file in one case; None in scenes that films cannot show.
+
+    It draws no random numbers of the training's. Where the training holds libsumo, the case runs through TraCI.
+    """
+    trained_in = read_policy_card(policy.with_suffix("")).get("scene")
+    contender = load_policy(policy, scene=T_INTERSECTION if trained_in == ALL_SCENES else None)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "film.gif"
+        try:
+            render_case(contender, CASE, file)
+        except InputError:
+            return None
+        return file.read_bytes()

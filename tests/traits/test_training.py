@@ -46,7 +46,9 @@ def test_a_run_writes_a_model_that_loads_as_trained(windows, small, tmp_path):
     assert card["latent_size"] == 2
     assert card["data"] == "street"
     assert card["windows"] == len(windows.length)
-    assert {path.name for path in (tmp_path / "run").glob("[!.]*")} == {"run.json", "model.json", "model.safetensors"}
+    assert {path.name for path in (tmp_path / "run").glob("[!.]*")} == {
+        *("run.json", "model.json", "model.safetensors", "tensorboard"),
+    }
 
 
 def test_an_interrupted_run_resumes_to_the_very_same_weights(windows, small, tmp_path, monkeypatch):
@@ -56,7 +58,7 @@ def test_an_interrupted_run_resumes_to_the_very_same_weights(windows, small, tmp
     with monkeypatch.context() as interrupted, pytest.raises(KeyboardInterrupt):
         interrupt_at_step(interrupted, steps_per_epoch + 3)
         train(windows, small, tmp_path / "broken")
-    assert {path.name for path in (tmp_path / "broken").glob("[!.]*")} == {"run.json", CHECKPOINT_FILE}
+    assert {path.name for path in (tmp_path / "broken").glob("[!.]*")} == {"run.json", CHECKPOINT_FILE, "tensorboard"}
 
     with monkeypatch.context() as counted:
         interrupt_at_step(counted, 2 * steps_per_epoch)  # the two epochs of three that are left
@@ -87,12 +89,12 @@ def test_the_seed_decides_the_result_and_the_global_generator_is_left_alone(wind
 @pytest.mark.parametrize("change", ["seed", "settings", "windows"])
 def test_a_folder_of_another_run_is_refused_and_kept(windows, small, tmp_path, change):
     train(windows, small, tmp_path)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     settings = replace(small, epochs=9) if change == "settings" else small
     shifted = replace(windows, states=windows.states + np.float32(0.5)) if change == "windows" else windows
     with pytest.raises(InputError, match=f"already holds another run.*{change}"):
         train(shifted, settings, tmp_path, seed=int(change == "seed"))
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_a_damaged_checkpoint_is_reported(windows, small, tmp_path, monkeypatch):

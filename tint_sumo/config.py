@@ -13,8 +13,8 @@ from tint_sumo.errors import InputError
 from tint_sumo.structures import FieldError, Where, build, choose
 
 NO_LEADER_GAP_M = 20.0  # stands for the gap of every driver without a leader, whatever its trait, and caps all gaps
-MIN_WINDOW_STEPS = 2  # of a window; a single step has no motion
-STEP_S = 0.1  # of simulations, and between the states of a window (code)
+MIN_WINDOW_STEPS = 2  # shortest window; a single step has no motion
+STEP_S = 0.1  # step of simulations, and time between the states of a window (code)
 WINDOW_STEPS = 20  # steps from which a trait is inferred, and between two inferences (paper III-C, code)
 LATENT_SIZE = 2  # numbers that represent a trait (paper III-B)
 P_CONSERVATIVE = (0.25, 0.4, 0.6)  # driver mixes of the paper's experiments (paper Fig. 4)
@@ -65,7 +65,7 @@ class DriverProfile:
     min_gap_m: tuple[float, float]  # uniform in this range (paper IV-A)
     entry_gap_m: tuple[float, float]  # bumper gap behind the leader at placement and entry, uniform (code)
     yields: bool  # whether the driver reacts to an ego that claims its lane (paper IV-A)
-    colour: str  # of the vehicle in figures and in sumo-gui, "r,g,b"
+    colour: str  # colour of the vehicle in figures and in sumo-gui, "r,g,b"
     weight: float = 1.0  # share among the profiles that yield as this one does, to the accuracy of whole vTypes
 
     def __post_init__(self) -> None:
@@ -120,7 +120,7 @@ class Population:
 
     profiles: tuple[DriverProfile, ...] = DRIVER_PROFILES
     members: int = 32  # vTypes of a profile of weight 1, each with its own draws
-    seed: int = 2022  # of the draws
+    seed: int = 2022  # seed of the draws
     idm: Idm = Idm()
 
     def __post_init__(self) -> None:
@@ -228,7 +228,7 @@ class EgoController:
     desired_speeds_mps: tuple[float, ...] = (0.0, 0.5, 3.0)  # the actions (paper III-C)
     gain_per_s: float = 2.0
     accel_limit_mps2: float = 3.0
-    unsafe_distance_m: float = 0.8  # between vehicle boxes
+    unsafe_distance_m: float = 0.8  # distance between vehicle boxes
     closing_distance_m: float = 1.0  # unsafe if also closing faster than closing_speed_mps
     closing_speed_mps: float = 1.0
     watches_behind: bool = True  # whether vehicles behind the ego count, too (code)
@@ -253,12 +253,12 @@ class Claim:
     wait for ever.
     """
 
-    by: Literal["front", "box"] = "front"  # of the ego, that enters the lane; the front's middle is the code's
+    by: Literal["front", "box"] = "front"  # the part of the ego that enters the lane; the code takes the front
     approach_speed_mps: float = 0.5  # speed towards the lane that counts as moving in
-    path_margin_m: float = 1.0  # this far past a lane's border it stands in the vehicles' path
-    courtesy_gap_m: float = 1.5  # that yielding drivers add to their minGap while their lane is claimed
-    reaction_time_s: float = 0.1  # before a driver brakes: a step
-    braking_mps2: float = 6.0  # that a driver is ready for: hard, but below the 9 m/s2 of an emergency
+    path_margin_m: float = 1.0  # an ego that is this far past a lane's border stands in the vehicles' path
+    courtesy_gap_m: float = 1.5  # yielding drivers add this to their minGap while their lane is claimed
+    reaction_time_s: float = 0.1  # time before a driver brakes: one step
+    braking_mps2: float = 6.0  # a driver is ready to brake so hard; an emergency has 9 m/s2
 
     def __post_init__(self) -> None:
         require_at_least(self, 0, "approach_speed_mps", "path_margin_m", "courtesy_gap_m", "reaction_time_s")
@@ -316,7 +316,7 @@ class PolicySettings:
     joint_sizes: tuple[int, ...] = (150, 100, 64)  # code
     hidden_size: int = 256  # code
     head_sizes: tuple[int, ...] = (256, 256)  # code
-    attention: bool = True  # without, all vehicles count the same (the paper's ablation, IV-D)
+    attention: bool = True  # without it, all vehicles count the same (the paper's ablation, IV-D)
     position_gain: float = 1.0  # positions are multiplied by this; observed in units of 20 m, they differ by little
 
     def __post_init__(self) -> None:
@@ -341,14 +341,14 @@ class PpoSettings:
     gamma: float = 0.99
     gae_lambda: float = 0.95
     clip_range: float = 0.2
-    ent_coef: float = 0.01  # at the beginning,
-    final_ent_coef: float = 0.01  # and at the end; in between it changes linearly
+    ent_coef: float = 0.01  # entropy weight at the beginning
+    final_ent_coef: float = 0.01  # entropy weight at the end; in between it changes linearly
     vf_coef: float = 0.5
     max_grad_norm: float = 0.5
     total_steps: int = 10_000_000  # paper
     policy: PolicySettings = field(default_factory=PolicySettings)
     action_repeat: int = 1  # paper: a decision every step
-    time_limit_s: float = 50.0  # of training episodes, where the scene's is not shorter; evaluation has the scene's
+    time_limit_s: float = 50.0  # limit of training episodes if the scene's is not shorter; evaluation has the scene's
 
     def __post_init__(self) -> None:
         counts = ("n_envs", "n_steps", "n_epochs", "n_minibatches", "total_steps", "action_repeat")

@@ -32,7 +32,7 @@ _PACKAGES = (
 class Origin:
     """The command that this process is running."""
 
-    words: tuple[str, ...]  # of its command line
+    words: tuple[str, ...]  # words of its command line
     config: Callable[[], str]  # gives the configuration file that says the same
 
     def provenance(self, *, with_versions: bool) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.structures import FieldError, Where, dotted, plain
 
 _END = "\n"
-_WIDTH = 116  # of comments and lists
+_WIDTH = 116  # width of comments and lists
 
 
 class _Loader(yaml.SafeLoader):

@@ -40,9 +40,9 @@ from tint_sumo.traits.training import train
 BREAKDOWN_METHOD = "clocks around the functions that do these parts, in a pass of its own, their own cost subtracted"
 
 _MIB = 2**20
-_WARM_UP_STEPS = 100  # of all replicas: their episodes begin together and drift apart
-_BARE_STEPS = 10  # of SUMO alone: one second, in which few vehicles leave and none would enter
-_CORES_TURNS = 3  # for each of the other measurements: whether two processes run at once depends on what else runs
+_WARM_UP_STEPS = 100  # steps of all replicas: their episodes begin together and drift apart
+_BARE_STEPS = 10  # steps of SUMO alone: one second, in which few vehicles leave and none would enter
+_CORES_TURNS = 3  # turns for each of the others: whether two processes run at once depends on what else runs
 _RECORD_WORKERS = 2
 _SAMPLING_S = 0.05
 _ENCODED = 64 * 12  # windows: all slots of 64 intersections
@@ -55,13 +55,13 @@ class Sizes:
     replicas: int = 64
     turns: int = 9
     turn_steps: int = 100
-    gym_turn_steps: int = 1_000  # of the single environment
+    gym_turn_steps: int = 1_000  # steps of the single environment
     windows: int = 100_000
     training_windows: int = 40_000
     ppo: PpoSettings = BUDGETS["full"].ppo
-    rollouts: int = 3  # of the policy's training, updates included
-    decisions: int = 1_000  # of one policy with one intersection
-    memory_env_steps: tuple[int, int] = (100_000, 2_000_000)  # of single intersections: growth from, growth to
+    rollouts: int = 3  # rollouts of the policy's training, updates included
+    decisions: int = 1_000  # decisions of one policy with one intersection
+    memory_env_steps: tuple[int, int] = (100_000, 2_000_000)  # memory growth is measured between these
 
 
 QUICK = Sizes(
@@ -112,7 +112,7 @@ class Benchmark:
     gym_env_steps_per_s: float
     cores: tuple[Cores, ...]
     record_windows_per_s: float
-    peak_rss_mib: float  # of the recorder's processes together
+    peak_rss_mib: float  # peak of all of the recorder's processes together
     windows: int
     memory_growth_mib: float
     train_windows_per_s: dict[str, float]  # by trait method, with one thread

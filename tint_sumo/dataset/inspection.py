@@ -80,7 +80,7 @@ class TraitStatistics:
     drivers: int = 0
     rows: int = 0
     speed_mps: Distribution = NOTHING
-    gap_m: Distribution = NOTHING  # of rows with a leader
+    gap_m: Distribution = NOTHING  # gaps of rows with a leader
     track_s: Distribution = NOTHING  # time on the street
 
     def __add__(self, other: "TraitStatistics") -> "TraitStatistics":

@@ -132,7 +132,7 @@ class _Watch:
         self._kinds = kinds
         self._rows: list[_Row] = []
         self._drivers: list[Mapping[str, Any]] = []
-        self._numbers: dict[str, int] = {}  # of the vehicles on the road
+        self._numbers: dict[str, int] = {}  # numbers of the vehicles on the road
 
     def look(self, time_s: float) -> None:
         vehicle = self._connection.vehicle

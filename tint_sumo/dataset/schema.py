@@ -23,7 +23,7 @@ DRIVERS = "drivers"
 TABLES = (TRAJECTORIES, DRIVERS)
 FCD = "fcd"
 _SUFFIX = {TRAJECTORIES: "parquet", DRIVERS: "parquet", FCD: "xml.gz"}
-_ROWS_KEY = {TRAJECTORIES: "rows", DRIVERS: "drivers"}  # of a table in the manifest
+_ROWS_KEY = {TRAJECTORIES: "rows", DRIVERS: "drivers"}  # names of a table's number of rows in the manifest
 
 
 def _field(name: str, dtype: pa.DataType, unit: str, meaning: str, nullable: bool = False) -> pa.Field:

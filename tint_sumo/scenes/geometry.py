@@ -239,7 +239,7 @@ def measure_distances_m(
         length_m, width_m: of every box.
         distance_m: (R, V) written; infinite for empty slots.
     """
-    radius_m = math.hypot(length_m, width_m) / 2  # of the circle around a box
+    radius_m = math.hypot(length_m, width_m) / 2  # the circle around a box
     for row in range(len(egos)):
         ego = egos[row]
         for slot in range(present.shape[1]):

@@ -17,7 +17,7 @@ from tint_sumo.config import (
 from tint_sumo.errors import InputError
 
 ALL_MIXES: Share = (0.1, 0.9)  # P(conservative) is drawn from this range in every episode
-SNAPSHOTS_PERCENT = (25, 50)  # of a training, after which the policy is kept, too
+SNAPSHOTS_PERCENT = (25, 50)  # parts of a training after which the policy is kept, too
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ class CeilingJob:
     """Compute the ceiling for each P(conservative) that policies are tested at."""
 
     trials: tuple[Trials, ...]
-    out: Path  # of the study
+    out: Path  # folder of the study
     scene: str | Scene = T_INTERSECTION
 
     name = "ceilings"

@@ -25,7 +25,7 @@ class Moment:
     """What there is to see after a step of the simulation; V vehicle slots, K routes of the traffic."""
 
     time_s: float
-    ego: np.void  # its pose
+    ego: np.void  # pose of the ego
     ego_mps: float
     ego_brakes: bool
     is_held: bool  # the ego's safety check overrides the policy
@@ -47,7 +47,7 @@ class _Driver:
 
     def __init__(self, contender: Contender) -> None:
         self._policy = contender.policy
-        inner: Any = getattr(contender.policy, "policy", contender.policy)  # of a Stable-Baselines3 model
+        inner: Any = getattr(contender.policy, "policy", contender.policy)  # a Stable-Baselines3 model holds its policy
         self._network = inner if isinstance(inner, GruPolicy) else None
         self._state: Any = None
         self._starts = np.ones(1, bool)

@@ -23,7 +23,7 @@ from tint_sumo.study.trait_reader import fit_reader
 
 SUFFIXES = (".mp4", ".gif", ".png")
 _STRIP, _GAP_PX = (4, 2), 4  # pictures across and down, and what is between them
-_LAST_S = 1.5  # for how long a film shows its last moment
+_LAST_S = 1.5  # a film shows its last moment for so long
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ class TrainJob:
     seed: int
     settings: PpoSettings
     shipped_traits: bool  # rather than a trait model of the study
-    out: Path  # of the study
+    out: Path  # folder of the study
     scene: AnyScene = T_INTERSECTION
 
     @property
@@ -89,10 +89,10 @@ class EvaluateJob:
     """Evaluate a trained policy, a shipped one, or a rule."""
 
     method: str
-    mix: Share | None  # of its training; None: a rule or a shipped policy
+    mix: Share | None  # mix of its training; None: a rule or a shipped policy
     seed: int
     trials: tuple[Trials, ...]
-    out: Path  # of the study
+    out: Path  # folder of the study
     scene: AnyScene = T_INTERSECTION
 
     @property

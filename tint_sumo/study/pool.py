@@ -17,7 +17,7 @@ from tint_sumo.standings import Title
 
 REFRESH_S = 1.0
 REPORT_INTERVAL_S = 0.2  # at most so often a job tells where it stands
-THREADS_PER_JOB = 1  # of torch: the jobs share the cores among them
+THREADS_PER_JOB = 1  # threads of torch: the jobs share the cores among them
 INTERRUPT_S = 30.0  # more than enough to save a checkpoint
 
 

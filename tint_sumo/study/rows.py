@@ -33,7 +33,7 @@ class Row:
     mix: Share | None  # P(conservative) in training
     conditions: Conditions
     seeds: tuple[int, ...]
-    evaluations: tuple[Evaluation, ...]  # of each seed
+    evaluations: tuple[Evaluation, ...]  # one for each seed
 
     @property
     def is_shipped(self) -> bool:

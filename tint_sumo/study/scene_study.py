@@ -33,13 +33,13 @@ _RESULTS = "results"
 class SceneStudy:
     """What is recorded, and which trait models are trained and tested on it."""
 
-    windows: int = 60_000  # of each scene and population
+    windows: int = 60_000  # windows of each scene and population
     methods: tuple[str, ...] = ("vae", "cross_window", "morton", "classifier")
     settings: TraitSettings = field(default_factory=lambda: replace(TRAIT_BUDGETS["full"], epochs=10))
     seeds: tuple[int, ...] = (0, 1, 2)
     noise_m: float = 0.0
     scenes: tuple[str, ...] = tuple(SCENES)
-    recording_seed: int = 77  # of the first scene; unlike that of any dataset a shipped model was trained on
+    recording_seed: int = 77  # seed of the first scene; no dataset of a shipped model has it
 
 
 SCENE_STUDIES = {"full": SceneStudy()}

@@ -36,8 +36,8 @@ class TraitStudy:
     methods: tuple[str, ...] = ("vae", "cross_window", "morton", "classifier")
     noises_m: tuple[float, ...] = (0.0, 0.05, 0.1, 0.2)
     seeds: tuple[int, ...] = (0, 1, 2)
-    p_conservative: float = 0.5  # of the training data
-    other_p: tuple[float, ...] = (0.25, 0.4, 0.6)  # of further test data
+    p_conservative: float = 0.5  # mix of the training data
+    other_p: tuple[float, ...] = (0.25, 0.4, 0.6)  # mixes of further test data
     other_windows: int = 30_000
     continuous_windows: int = 240_000
     continuous_methods: tuple[str, ...] = ("vae", "cross_window")

@@ -26,7 +26,7 @@ from tint_sumo.traits.storage import RUN_MODEL, load, save
 CHECKPOINT_FILE = "checkpoint.pt"
 CHECKPOINT_INTERVAL_S = 10.0
 MAX_GRAD_NORM = 1.0  # a rare batch must not undo the others
-BFLOAT16_HIDDEN_SIZE = 64  # from this size on bfloat16 is the faster one on CPUs
+BFLOAT16_HIDDEN_SIZE = 64  # bfloat16 is faster on CPUs from this size on
 
 
 def train(

@@ -20,8 +20,8 @@ _COLOURS = (
 )
 _MARKERS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-down", "cross", "hexagon", "pentagon")
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
-_ROW_PX = 46  # of a method
-_CURVE_LINES = 10  # of the table of learning curves
+_ROW_PX = 46  # height of a method's row
+_CURVE_LINES = 10  # rows of the table of learning curves
 
 
 @dataclass(frozen=True)

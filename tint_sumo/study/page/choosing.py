@@ -11,7 +11,7 @@ from tint_sumo.study.rows import Row, at_mixes, by_title, over_all_mixes
 
 FAILURES = ("collision", "timeout")
 MOST_CASES = 14
-_FAILURES_OF_EACH = 2  # of each kind and policy, as far as there is room
+_FAILURES_OF_EACH = 2  # failures of each kind and policy, as far as there is room
 _SUCCESSES = 2
 
 
@@ -23,7 +23,7 @@ class Shown:
     method: str
     mix: Share | None  # P(conservative) in training; None where the study did not train
     seed: int
-    evaluation: Evaluation  # of all cases that it was tested on
+    evaluation: Evaluation  # results in all cases that it was tested on
 
     @property
     def label(self) -> str:

@@ -28,7 +28,7 @@ from tint_sumo.study.pool import THREADS_PER_JOB, run_jobs
 from tint_sumo.study.trait_reader import TraitReader, fit_reader
 
 EPISODES = "episodes"  # folder of the recorded episodes in a study's folder
-FORMAT = 1  # of the files there
+FORMAT = 1  # number of the files' format
 MISSING = -32768  # a column's number where there is nothing to tell
 # What the numbers of each column are multiples of. A column holds the first number, then what each differs by.
 UNITS = {
@@ -53,12 +53,12 @@ class Recording:
     """How a policy drives in some cases, as a file."""
 
     method: str
-    mix: Share | None  # of its training; None: a rule or a shipped policy
+    mix: Share | None  # mix of its training; None: a rule or a shipped policy
     seed: int
     conditions: Conditions
     cases: tuple[int, ...]
     out: Path  # folder of the study
-    scene: str | Scene = T_INTERSECTION  # of the study
+    scene: str | Scene = T_INTERSECTION  # scene of the study
 
     @property
     def label(self) -> str:

@@ -72,7 +72,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {file.name: file.read_bytes() for file in folder.glob("[!.]*")}
+    """What a user sees in a folder, apart from the log, which tells the time."""
+    return {file.name: file.read_bytes() for file in folder.glob("[!.]*") if file.is_file()}
 
 
 def interrupt_at_step(monkeypatch: pytest.MonkeyPatch, step: int) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, find_named
 from tint_sumo.structures import FieldError, Where, build, choose
 
 NO_LEADER_GAP_M = 20.0  # stands for the gap of every driver without a leader, whatever its trait, and caps all gaps
@@ -158,9 +158,7 @@ def find_population(name: str) -> Population:
     Raises:
         InputError: there is none.
     """
-    if name not in POPULATIONS:
-        raise InputError(f"unknown population {name!r}; choose one of: {', '.join(POPULATIONS)}")
-    return POPULATIONS[name]
+    return find_named("population", name, POPULATIONS)
 
 
 def population_name(population: Population) -> str | None:

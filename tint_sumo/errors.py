@@ -1,8 +1,24 @@
-"""The one exception type for mistakes a user can mend."""
+"""The one exception type for mistakes a user can mend, and the mistake of a name that nothing has."""
+
+from collections.abc import Mapping
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 class InputError(ValueError):
     """Bad input: one line that says what is wrong and how to mend it. The command line exits with code 2 on it."""
+
+
+def find_named(kind: str, name: str, known: Mapping[str, T]) -> T:
+    """The one of the known things that has this name.
+
+    Raises:
+        InputError: none has; ``kind`` says in the message what was looked for.
+    """
+    if name not in known:
+        raise InputError(f"unknown {kind} {name!r}; choose one of: {', '.join(known)}")
+    return known[name]
 
 
 RENAMED_METHODS = {"ours": "vae", "ours_plus": "cross_window"}  # what methods were called up to version 0.1

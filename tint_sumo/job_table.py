@@ -38,7 +38,7 @@ class Screen(Protocol):
 
 
 class JobTable:
-    """Is told of some jobs, and shows where they stand; :func:`job_table` makes one."""
+    """Is told of some jobs, and shows where they stand; ``job_table`` makes one."""
 
     def __init__(self, overview: Overview, screen: Screen, clock: Callable[[], float] = time.monotonic) -> None:
         self._overview = overview

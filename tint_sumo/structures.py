@@ -79,13 +79,31 @@ def choose(value: Any, named: Mapping[str, T], default: str, where: Where = ()) 
     Raises:
         FieldError: there is no such name, or a value does not fit.
     """
-    if isinstance(value, str):
+    if not is_mapping(value, named, where):
         return require_known(value, named, where)
-    if not isinstance(value, Mapping):
-        raise FieldError(where, f"must be a name ({', '.join(named)}) or a mapping of settings, not {value!r}")
-    name = require_known(value.get("base", default), named, (*where, "base"))
+    name = require_base(value, named, default, where)
     changed = overlay(named[name], {key: one for key, one in value.items() if key != "base"}, where)
     return next((known for known, one in named.items() if one == changed), changed)
+
+
+def is_mapping(value: Any, named: Mapping[str, Any], where: Where) -> bool:
+    """Whether a file gives a mapping in place of a name.
+
+    Raises:
+        FieldError: it gives neither.
+    """
+    if not isinstance(value, str | Mapping):
+        raise FieldError(where, f"must be a name ({', '.join(named)}) or a mapping of settings, not {value!r}")
+    return isinstance(value, Mapping)
+
+
+def require_base(value: Mapping[str, Any], named: Mapping[str, Any], default: str, where: Where) -> str:
+    """The name that a mapping calls its ``base``, if it is a known one.
+
+    Raises:
+        FieldError: it is not.
+    """
+    return require_known(value.get("base", default), named, (*where, "base"))
 
 
 def require_known(name: Any, known: Mapping[str, Any] | Sequence[str], where: Where) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.traits.interruptions import interrupt_at_step
 from tint_sumo.cli import main
 from tint_sumo.config import STEP_S, TraitSettings
 from tint_sumo.dataset.schema import MANIFEST, SCHEMA_VERSION
@@ -25,7 +26,6 @@ from tint_sumo.study.trait_models import train_traits
 from tint_sumo.traits import TRAIT_METHODS, training
 from tint_sumo.traits.storage import read_card
 from tint_sumo.traits.training import CHECKPOINT_FILE
-from tint_sumo.traits.vae import Vae
 
 EPISODES = 16  # of each shard
 SMALL = TraitSettings(
@@ -74,18 +74,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def files(folder: Path) -> dict[str, bytes]:
     """What a user sees in a folder, apart from the log, which tells the time."""
     return {file.name: file.read_bytes() for file in folder.glob("[!.]*") if file.is_file()}
-
-
-def interrupt_at_step(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    """Press Ctrl-C in the middle of training, before the given gradient step."""
-    original, calls = Vae.loss, iter(range(step))
-
-    def loss(self, *args):
-        if next(calls, None) is None:
-            raise KeyboardInterrupt
-        return original(self, *args)
-
-    monkeypatch.setattr(Vae, "loss", loss)
 
 
 @pytest.mark.parametrize("method", sorted(TRAIT_METHODS))

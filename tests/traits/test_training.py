@@ -11,6 +11,7 @@ from tint_sumo.traits.evaluation import evaluate
 from tint_sumo.traits.training import CHECKPOINT_FILE, train
 from tint_sumo.traits.vae import Vae
 
+from .interruptions import interrupt_at_step
 from .scenes import two_populations
 
 
@@ -23,18 +24,6 @@ def assert_same_weights(one, other):
     assert one.state_dict().keys() == other.state_dict().keys()
     for name, value in one.state_dict().items():
         assert torch.equal(value, other.state_dict()[name]), name
-
-
-def interrupt_at_step(monkeypatch, step):
-    """Press Ctrl-C in the middle of training, before the given gradient step."""
-    original, calls = Vae.loss, iter(range(step))
-
-    def loss(self, *args):
-        if next(calls, None) is None:
-            raise KeyboardInterrupt
-        return original(self, *args)
-
-    monkeypatch.setattr(Vae, "loss", loss)
 
 
 def test_a_run_writes_a_model_that_loads_as_trained(windows, small, tmp_path):

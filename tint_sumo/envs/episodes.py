@@ -111,9 +111,8 @@ class Episodes:
         scene = settings.played
         self.simulation = make_simulation(num_envs, scene, settings.backend)
         self.rows = np.zeros(num_envs, row_type(scene.max_vehicles)) if rows is None else rows
-        self._trait_of_member = np.array(
-            [*self.simulation.trait_of_member, NOBODY], np.int8
-        )  # the last one stands for empty slots
+        traits = (*self.simulation.trait_of_member, NOBODY)  # the last one stands for empty slots
+        self._trait_of_member = np.array(traits, np.int8)
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
         self._scales = Scales(POSITION_SCALE_M, SPEED_SCALE_MPS, scene.step_s)
         self._speeds_mps = np.array(scene.ego.controller.desired_speeds_mps)

@@ -18,7 +18,7 @@ from tint_sumo.config import (
     require_at_least,
     require_positive,
 )
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, find_named
 from tint_sumo.scenes.network import Network, Point
 
 if TYPE_CHECKING:
@@ -126,9 +126,7 @@ def find_scene(scene: Any) -> Any:
     """
     if not isinstance(scene, str):
         return scene
-    if scene not in SCENES:
-        raise InputError(f"unknown scene {scene!r}; choose one of: {', '.join(SCENES)}")
-    return SCENES[scene]()
+    return find_named("scene", scene, SCENES)()
 
 
 def digest_of(name: str) -> str:

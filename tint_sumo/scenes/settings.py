@@ -11,7 +11,7 @@ from tint_sumo.config import Claim, EgoController, Population, VehicleShape
 from tint_sumo.errors import InputError
 from tint_sumo.scenes.own import OwnScene, from_sumocfg
 from tint_sumo.scenes.scene import ALL_SCENES, SCENES, T_INTERSECTION, Scene, digest_of, find_scene
-from tint_sumo.structures import FieldError, Where, build, overlay, plain, require_known
+from tint_sumo.structures import FieldError, Where, build, is_mapping, overlay, plain, require_base, require_known
 
 AnyScene = str | Scene | OwnScene
 
@@ -41,7 +41,7 @@ class SceneSettings:
     step_s: float
     """Step of the simulation."""
     time_limit_s: float
-    """Of an episode."""
+    """Longest time of an episode."""
 
     def __post_init__(self) -> None:
         if self.name in SCENES:
@@ -103,7 +103,7 @@ class OwnSceneSettings:
     warm_up_s: float = OwnScene.warm_up_s
     """For how long the traffic runs before the ego appears."""
     time_limit_s: float = OwnScene.time_limit_s
-    """Of an episode."""
+    """Longest time of an episode."""
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     """The ego's shape."""
     controller: EgoController = field(default_factory=EgoController)
@@ -131,14 +131,12 @@ def read_scene(value: Any, where: Where = ()) -> AnyScene:
     Raises:
         FieldError: there is no such scene, or a value does not fit.
     """
-    if isinstance(value, str):
+    if not is_mapping(value, SCENES, where):
         return require_known(value, SCENES, where)
-    if not isinstance(value, Mapping):
-        raise FieldError(where, f"must be a name ({', '.join(SCENES)}) or a mapping of settings, not {value!r}")
     if "sumocfg" in value:
         settings: Any = build(OwnSceneSettings, value, where)
     else:
-        base = require_known(value.get("base", T_INTERSECTION), SCENES, (*where, "base"))
+        base = require_base(value, SCENES, T_INTERSECTION, where)
         settings = overlay(SceneSettings.of(find_scene(base)), value, where)
     try:
         made: AnyScene = settings.scene()

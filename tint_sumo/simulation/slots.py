@@ -38,9 +38,8 @@ class Slots:
         self.member: Numbers = np.full(shape, EMPTY)
         self.vehicle_number: Numbers = np.full(shape, EMPTY)
         self._lane_pos_m: Floats = np.zeros(shape)
-        self._was_present: Bools = np.zeros(
-            shape, bool
-        )  # whether it was there at the previous step: then the slot takes no new vehicle yet
+        # A slot that held a vehicle at the previous step takes no new one yet.
+        self._was_present: Bools = np.zeros(shape, bool)
         self._newcomer, self._newcomer_pos_m = np.zeros(1, np.int64), np.zeros(1)
         self.newest: Numbers = np.full((replicas, len(layout.routes)), EMPTY)  # slot of each route's last newcomer
 

@@ -14,7 +14,7 @@ from tint_sumo.config import (
     require_positive,
     require_share,
 )
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, find_named
 
 ALL_MIXES: Share = (0.1, 0.9)  # P(conservative) is drawn from this range in every episode
 SNAPSHOTS_PERCENT = (25, 50)  # parts of a training after which the policy is kept, too
@@ -34,7 +34,8 @@ class Conditions:
         require_at_least(self, 0, "position_noise_m")
         require_positive(self, "tau_s")
         if self.percent not in (*SNAPSHOTS_PERCENT, 100):
-            raise InputError(f"percent must be one of 25, 50, 100, when policies are kept, not {self.percent}")
+            kept = ", ".join(map(str, (*SNAPSHOTS_PERCENT, 100)))
+            raise InputError(f"percent must be one of {kept}, when policies are kept, not {self.percent}")
 
     @property
     def is_single_mix(self) -> bool:
@@ -193,6 +194,4 @@ def find_budget(name: str) -> Budget:
     Raises:
         InputError: there is none.
     """
-    if name not in BUDGETS:
-        raise InputError(f"unknown budget {name!r}; choose one of: {', '.join(BUDGETS)}")
-    return BUDGETS[name]
+    return find_named("budget", name, BUDGETS)

@@ -21,8 +21,8 @@ _TITLE_HEIGHT_PX, _SCENE_HEIGHT_PX = 30, 346  # the rest of a frame is words
 _OVERSAMPLING = 2
 _OUTLINE_M, _RING_M = 0.28, 0.12  # outline of the true trait, and white line around the inferred one
 _LAMP_M, _EDGE_M = 0.45, 0.12
-_HALO_M = (1.6, 5.5)  # radius of the halo of a vehicle without weight, and of one that has it all
-_LEAST_WEIGHT = 0.03  # a vehicle with less has no halo
+HALO_M = (1.6, 5.5)  # radius of the halo of a vehicle without weight, and of one that has it all
+LEAST_WEIGHT = 0.03  # a vehicle with less has no halo
 _EGO, _UNSURE, _WHITE = (240, 180, 0), (190, 190, 190), (255, 255, 255)
 _LAMP, _GLASS, _INK, _PAPER, _FAINT = (255, 40, 40), (43, 47, 51), (30, 33, 37), (250, 250, 247), (110, 116, 122)
 _HALO, _CLAIM, _WAY = (255, 225, 60, 105), (0, 150, 140, 75), (240, 180, 0, 130)
@@ -160,10 +160,10 @@ def _draw_lamp(canvas: Canvas, pose: np.void, back_m: float, across_m: tuple[flo
 
 def _draw_halo(canvas: Canvas, pose: np.void, weight: float) -> None:
     """A disc whose area grows with the weight."""
-    if weight < _LEAST_WEIGHT:
+    if weight < LEAST_WEIGHT:
         return
     ((across, down),) = canvas.pixels(np.array([[pose["x_m"], pose["y_m"]]]))
-    least_m, most_m = _HALO_M
+    least_m, most_m = HALO_M
     radius = (least_m + (most_m - least_m) * weight**0.5) * canvas.pixels_per_m
     canvas.draw.ellipse((across - radius, down - radius, across + radius, down + radius), fill=_HALO)
 

@@ -66,7 +66,7 @@ def render_case(
     if not 0 <= case < CASES_PER_SEED:
         raise InputError(f"case must lie in 0 to {CASES_PER_SEED - 1}, not {case}")
     share = contender.p_conservative if p_conservative is None else p_conservative
-    played = _require_film_scene(contender)
+    played = require_film_scene(contender)
     moments = list(drive_case(contender, case, seed, p_conservative=share, **task))
     shown = _spread(moments) if out.suffix == ".png" else moments
     parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(share))
@@ -77,7 +77,7 @@ def render_case(
     return Film(moments[-1].outcome, round(moments[-1].time_s, 3), len(shown))
 
 
-def _require_film_scene(contender: Contender) -> Scene:
+def require_film_scene(contender: Contender) -> Scene:
     """The contender's scene; InputError unless a film can show it."""
     scene = find_scene(contender.scene)
     if isinstance(scene, OwnScene):

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.errors import InputError, refuse_old_name
+from tint_sumo.errors import InputError, find_named, refuse_old_name
 from tint_sumo.policy.trait_sources import (
     ClassifierTraits,
     EncoderTraits,
@@ -89,9 +89,7 @@ def find_method(name: str) -> Method:
         InputError: there is none.
     """
     refuse_old_name(name)
-    if name not in METHODS:
-        raise InputError(f"unknown method {name!r}; choose one of: {', '.join(METHODS)}")
-    return METHODS[name]
+    return find_named("method", name, METHODS)
 
 
 def find_learned(name: str) -> Learned:

@@ -7,15 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tint_sumo.config import ends
+from tint_sumo.config import share_words
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.files import write_text
 from tint_sumo.study.ceiling_job import read_ceilings
 from tint_sumo.study.figures import plot_bars, plot_curves, plot_worlds
-from tint_sumo.study.methods import METHODS
 from tint_sumo.study.policy_jobs import read_curves
 from tint_sumo.study.results import read_results
-from tint_sumo.study.rows import Row, at_mixes, over_all_mixes, tabulate
+from tint_sumo.study.rows import Row, at_mixes, by_method, by_title, over_all_mixes, tabulate
 from tint_sumo.study.statistics import difference_interval
 from tint_sumo.study.tables import Lines, Table
 
@@ -130,7 +129,7 @@ _WORLDS_NOTE = (
 def _success_lines(rows: Sequence[Row], ceilings: Ceilings) -> Lines:
     mixes = sorted({_number(row) for row in rows})
     lines = [["method", "seeds", *(f"P {p:g}" for p in mixes)]]
-    kinds = dict.fromkeys((row.method, row.origin, row.title, row.mix) for row in _by_method(rows))
+    kinds = dict.fromkeys((row.method, row.origin, row.title, row.mix) for row in by_method(rows))
     for method, origin, title, mix in kinds:
         own = {_number(row): row for row in rows if (row.method, row.origin, row.mix) == (method, origin, mix)}
         cells = [_with_spread(own[p]) if p in own else "-" for p in mixes]
@@ -164,8 +163,7 @@ def _outcome_lines(rows: Sequence[Row]) -> Lines:
 def _collision_lines(rows: Sequence[Row]) -> Lines:
     kinds = sorted({kind for row in rows for kind in row.collisions})
     lines = [["method", *kinds]]
-    for title in dict.fromkeys(row.title for row in _by_method(rows)):
-        own = [row for row in rows if row.title == title]
+    for title, own in by_title(rows).items():
         cases = sum(row.episodes * len(row.seeds) for row in own)
         counts = [sum(row.collisions.get(kind, 0) for row in own) for kind in kinds]
         lines.append([title, *(f"{1000 * count / cases:.1f}" for count in counts)])
@@ -183,7 +181,7 @@ def _difference_lines(rows: Sequence[Row]) -> Lines:
     lines = [["method", "less", *(f"P {p:g}" for p in mixes)]]
     for other in ("oracle", "no_labels"):
         references = {_number(row): row for row in trained if row.method == other}
-        for method in dict.fromkeys(row.method for row in _by_method(trained) if row.method != other):
+        for method in dict.fromkeys(row.method for row in by_method(trained) if row.method != other):
             own = {_number(row): row for row in trained if row.method == method}
             if references and own:
                 cells = [_difference(own.get(p), references.get(p)) for p in mixes]
@@ -201,20 +199,14 @@ def _difference(row: Row | None, other: Row | None) -> str:
 def _world_lines(rows: Sequence[Row]) -> Lines:
     worlds = list(dict.fromkeys(row.conditions for row in rows))
     lines = [["method", *(one.label for one in worlds)]]
-    for title in dict.fromkeys(row.title for row in _by_method(rows)):
-        own = {row.conditions: row for row in rows if row.title == title}
+    for title, own in by_title(rows).items():
+        at = {row.conditions: row for row in own}
         cells = [
-            f"{100 * own[one].rate('success'):.1f} ({100 * own[one].rate('collision'):.1f})" if one in own else "-"
+            f"{100 * at[one].rate('success'):.1f} ({100 * at[one].rate('collision'):.1f})" if one in at else "-"
             for one in worlds
         ]
         lines.append([title, *cells])
     return lines
-
-
-def _by_method(rows: Sequence[Row]) -> list[Row]:
-    """In the registry's order, whatever the conditions."""
-    order = {name: position for position, name in enumerate(METHODS)}
-    return sorted(rows, key=lambda row: (order.get(row.method, len(order)), row.origin))
 
 
 def _number(row: Row) -> float:
@@ -224,7 +216,7 @@ def _number(row: Row) -> float:
 
 
 def _mix(row: Row) -> str:
-    return " to ".join(f"{p:g}" for p in dict.fromkeys(ends(row.conditions.p_conservative)))
+    return share_words(row.conditions.p_conservative)
 
 
 def _percent(share: float | None, digits: int = 2) -> str:

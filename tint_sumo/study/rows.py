@@ -151,11 +151,16 @@ def over_all_mixes(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if isinstance(row.conditions.p_conservative, tuple)]
 
 
+def by_method(rows: Sequence[Row]) -> list[Row]:
+    """The rows in the registry's order, whatever the conditions; shipped policies come first."""
+    order = {name: position for position, name in enumerate(METHODS)}
+    return sorted(rows, key=lambda row: (order.get(row.method, len(order)), row.origin != GIVEN))
+
+
 def by_title(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """The rows of each method, shipped policies apart, in the registry's order."""
-    order = {name: position for position, name in enumerate(METHODS)}
     found: dict[str, list[Row]] = {}
-    for row in sorted(rows, key=lambda row: (order.get(row.method, len(order)), row.origin != GIVEN)):
+    for row in by_method(rows):
         found.setdefault(row.title, []).append(row)
     return found
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from tint_sumo.errors import InputError
 from tint_sumo.policy.storage import read_policy_card
 from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION
-from tint_sumo.study.film import render_case
+from tint_sumo.study.film import render_case, require_film_scene
 from tint_sumo.study.loading import load_policy
 
 CASE = 1  # always the same one, which no policy is trained on
@@ -19,10 +19,11 @@ def film_policy(policy: Path) -> bytes | None:
     """
     trained_in = read_policy_card(policy.with_suffix("")).get("scene")
     contender = load_policy(policy, scene=T_INTERSECTION if trained_in == ALL_SCENES else None)
+    try:
+        require_film_scene(contender)
+    except InputError:
+        return None
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "film.gif"
-        try:
-            render_case(contender, CASE, file)
-        except InputError:
-            return None
+        render_case(contender, CASE, file)
         return file.read_bytes()

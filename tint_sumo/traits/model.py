@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from tint_sumo.config import LATENT_SIZE, TraitSettings
-from tint_sumo.errors import InputError, refuse_old_name
+from tint_sumo.errors import find_named, refuse_old_name
 from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import WindowEncoder
 
@@ -151,6 +151,4 @@ def find_trait_method(name: Any) -> type[TraitModel]:
         InputError: there is none.
     """
     refuse_old_name(name)
-    if name not in TRAIT_METHODS:
-        raise InputError(f"unknown trait method {name!r}; choose one of: {', '.join(sorted(TRAIT_METHODS))}")
-    return TRAIT_METHODS[name]
+    return find_named("trait method", name, dict(sorted(TRAIT_METHODS.items())))

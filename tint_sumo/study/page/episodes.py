@@ -7,10 +7,9 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from tint_sumo.config import ends
+from tint_sumo.config import share_words
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import Scene
-from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import Case
 from tint_sumo.study.methods import METHODS
 from tint_sumo.study.page.choosing import FAILURES, Choice, Shown
@@ -94,8 +93,8 @@ def player_notes(recordings: Recordings) -> str:
     parts = [
         paragraph(
             f"Each method is shown with its policy of the first seed, in the same {len(choice.cases)} of the study's "
-            f"cases ({_world(choice.conditions)}): failures of every method, and a few successes. "
-            "The policies take their likeliest actions, as they did in the tests."
+            f"cases (P(conservative) {share_words(choice.conditions.p_conservative)}): failures of every method, and a "
+            "few successes. The policies take their likeliest actions, as they did in the tests."
         )
     ]
     if differing := _differing(recordings):
@@ -146,8 +145,3 @@ def _differing(recordings: Recordings) -> int:
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}" + ("" if number == 1 else "s")
-
-
-def _world(conditions: Conditions) -> str:
-    low, high = ends(conditions.p_conservative)
-    return f"P(conservative) {low:g}" + (f" to {high:g}" if high > low else "")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tint_sumo import traits
-from tint_sumo.config import LATENT_SIZE, NO_LEADER_GAP_M, POPULATIONS
+from tint_sumo.config import LATENT_SIZE, NO_LEADER_GAP_M, POPULATIONS, STEP_S
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows
 from tint_sumo.study.methods import METHODS, Learned
@@ -42,6 +42,7 @@ def read_latents(out: Path, methods: Sequence[str], *, progress: bool) -> dict[s
     return {
         "traits": names,
         "step_m": _STEP_M,
+        "step_s": STEP_S,
         "windows": [
             {
                 "driver": int(drawn.driver[one]),

@@ -8,6 +8,7 @@ import shapely
 from tint_sumo.scenes import Scene, find_scene
 from tint_sumo.scenes.geometry import SPACING_M, Floats, as_line
 from tint_sumo.scenes.layout import layout
+from tint_sumo.study.drawing import HALO_M, LEAST_WEIGHT
 
 _TOLERANCE_M = 0.02
 
@@ -34,6 +35,8 @@ def scene_shapes(place: str | Scene) -> dict[str, Any]:
         "vehicle": {"length_m": scene.vehicle.length_m, "width_m": scene.vehicle.width_m},
         "traits": [profile.name for profile in scene.population.profiles],
         "step_s": scene.step_s,
+        "halo_m": HALO_M,
+        "least_weight": LEAST_WEIGHT,
     }
 
 

@@ -3,7 +3,6 @@
 const SPACE = { width: 440, height: 400, margin: 34 };
 const TRACE = { width: 440, height: 190, margin: 40 };
 const NEIGHBOURS = 5;
-const WINDOW_STEP_S = 0.1;
 
 // A line that maps numbers to places in a drawing.
 const scale = (values, from, to) => {
@@ -13,8 +12,8 @@ const scale = (values, from, to) => {
 };
 
 class LatentSpace {
-  constructor({ traits, step_m: step, windows, models }) {
-    Object.assign(this, { traits, step, windows, models });
+  constructor({ traits, step_m: step, step_s, windows, models }) {
+    Object.assign(this, { traits, step, step_s, windows, models });
     this.svg = document.querySelector("#space svg");
     for (const { name, own } of models) byId("model").append(make("option", { value: name }, own ? name : `${name} (shipped)`));
     byId("model").addEventListener("change", () => this.draw());
@@ -80,7 +79,7 @@ class LatentSpace {
     const { trait, desired_speed_mps: speed, min_gap_m: gap, offsets } = this.windows[number];
     const [first, second] = this.latents[number];
     const alike = near.filter((one) => this.windows[one].trait === trait).length;
-    const seconds = (offsets.length * WINDOW_STEP_S).toFixed(1);
+    const seconds = (offsets.length * this.step_s).toFixed(1);
     return (
       `Window of ${this.name(number)} in truth, who wants to drive ${speed.toFixed(1)} m/s and keeps a gap of ` +
       `${gap.toFixed(2)} m when it stands; seen for ${seconds} s. Latents ${first.toFixed(2)} and ${second.toFixed(2)}; ${alike} of ${near.length} neighbours share its trait.`

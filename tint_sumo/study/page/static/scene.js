@@ -1,8 +1,5 @@
 // The roads from above with all vehicles, at one frame of an episode. Lengths are in m; y leads down, as in SVG.
 
-const HALO_M = [1.6, 5.5]; // radius of a vehicle's halo without weight, and with all of it
-const LEAST_WEIGHT = 0.03; // a vehicle with less has no halo
-
 class SceneView {
   constructor(svg, shapes) {
     this.shapes = shapes;
@@ -27,13 +24,14 @@ class SceneView {
 
   draw(moment) {
     for (const [name, route] of Object.entries(this.routes)) route.classList.toggle("claimed", moment.claims.includes(name));
-    const weighty = moment.vehicles.filter((one) => one.attention >= LEAST_WEIGHT);
+    const weighty = moment.vehicles.filter((one) => one.attention >= this.shapes.least_weight);
     this.halos.replaceChildren(...weighty.map((one) => this.halo(one)));
     this.vehicles.replaceChildren(...moment.vehicles.map((one) => this.driver(one)), this.box(moment.ego, "ego", "E"));
   }
 
   halo(one) {
-    const radius = HALO_M[0] + (HALO_M[1] - HALO_M[0]) * Math.sqrt(one.attention);
+    const [least, most] = this.shapes.halo_m;
+    const radius = least + (most - least) * Math.sqrt(one.attention);
     return makeSvg("circle", { class: "halo", cx: one.x_m, cy: -one.y_m, r: radius });
   }
 

@@ -168,7 +168,7 @@ def start(tmp_path: Path) -> Callable[..., tuple["subprocess.Popen[bytes]", int]
 
     def started(*argv: str) -> tuple["subprocess.Popen[bytes]", int]:
         ours, theirs = open_terminal()
-        command = [sys.executable, "-m", "tests.study.jobs", str(tmp_path), *argv]
+        command = [sys.executable, "-m", "tests.executors.jobs", str(tmp_path), *argv]
         process = subprocess.Popen(command, stderr=theirs, env={**os.environ, "TERM": "xterm"})
         os.close(theirs)
         return process, ours

@@ -89,7 +89,7 @@ def test_importing_the_package_loads_no_more_than_gymnasium() -> None:
 
 def test_floors_import_downwards_only() -> None:
     floors = [
-        "compiling config errors files job_table processes progress provenance standings structures timing "
+        "compiling config errors executors files job_table processes progress provenance standings structures timing "
         "training_log yaml_files",
         "scenes",
         "simulation",

@@ -31,7 +31,7 @@ from tint_sumo.configuration import (
     read_command,
     write_command,
 )
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, JobError
 from tint_sumo.provenance import Origin, made_by
 from tint_sumo.structures import Where
 
@@ -672,7 +672,7 @@ class TintSumo:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code is 0, 2 after bad input, or 130 after an interruption."""
+    """Run one command; the exit code is 0, 1 if jobs failed, 2 after bad input, or 130 after an interruption."""
     words = list(sys.argv[1:] if argv is None else argv)
     after_interrupt = Command.after_interrupt
     if words[:1] == ["--print-completion"] and words[1:] in ([shell] for shell in get_args(Shell)):
@@ -686,9 +686,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         with made_by(Origin(tuple(words), partial(write_command, command))):
             outcome = command.run()
-    except InputError as error:
+    except (InputError, JobError) as error:
         print(f"tint-sumo: error: {error}", file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, InputError) else 1
     except OSError as error:
         if error.filename is None:
             raise

@@ -21,6 +21,10 @@ def find_named(kind: str, name: str, known: Mapping[str, T]) -> T:
     return known[name]
 
 
+class JobError(RuntimeError):
+    """Jobs were given up: which, and why, in one line. The command line exits with code 1 on it."""
+
+
 RENAMED_METHODS = {"ours": "vae", "ours_plus": "cross_window"}  # what methods were called up to version 0.1
 
 

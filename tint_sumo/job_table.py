@@ -69,6 +69,19 @@ class JobTable:
         self._screen.end(f"{title}: {found} ({duration(took_s)})")
         self._screen.show(self._overview, now_s)
 
+    def fail(self, title: Title, reason: str, *, again: bool) -> None:
+        """A job has failed, whether it had begun or not; it waits ``again``, or is given up."""
+        overview = self._overview
+        overview.standings.pop(title, None)
+        if title in overview.waiting:
+            overview.waiting.remove(title)
+        if again:
+            overview.waiting.append(title)
+        else:
+            overview.given_up += 1
+        self._screen.end(f"{title}: {reason}")
+        self._screen.show(overview, self._clock())
+
     def refresh(self) -> None:
         """Keep the clocks going."""
         self._screen.show(self._overview, self._clock())
@@ -199,7 +212,8 @@ def _stacked_cells(standing: Standing, now_s: float) -> list[str | ProgressBar]:
 def _whole(overview: Overview, now_s: float) -> str:
     left_s = overview.left_s(now_s)
     left = "" if left_s is None else f", about {duration(left_s)} left"
-    return f"{overview.done} of {overview.total} jobs are done{left}"
+    given_up = f", {overview.given_up} given up" if overview.given_up else ""
+    return f"{overview.done} of {overview.total} jobs are done{given_up}{left}"
 
 
 def report_line(overview: Overview, now_s: float) -> str:

@@ -83,16 +83,17 @@ class Standing:
 
 @dataclass
 class Overview:
-    """All jobs: those that wait, those that are being done, and how long others took."""
+    """All jobs: those that wait, those that are being done, how long others took, and how many were given up."""
 
     total: int
     waiting: list[Title]
     standings: dict[Title, Standing] = field(default_factory=dict)
     took_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))  # by task
+    given_up: int = 0
 
     @property
     def done(self) -> int:
-        return self.total - len(self.waiting) - len(self.standings)
+        return self.total - self.given_up - len(self.waiting) - len(self.standings)
 
     def left_s(self, now_s: float) -> float | None:
         """How long all will take, if a job takes as long as others of its task; None if no time is known yet."""

@@ -7,7 +7,6 @@ leaders that SUMO's drivers see; ``route`` is empty.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,13 +14,14 @@ import numpy as np
 import pandas as pd
 
 from tint_sumo.config import STEP_S
-from tint_sumo.dataset.schema import SCHEMA_VERSION
+from tint_sumo.dataset.schema import SCHEMA_VERSION, TABLES, shard_path
 from tint_sumo.dataset.shards import (
     EPISODE_STEPS,
+    ShardContents,
     has_tables,
     record_dataset,
-    recorded_windows,
     require_sizes,
+    shard_contents,
     write_tables,
 )
 from tint_sumo.errors import InputError
@@ -72,7 +72,7 @@ def record_sumocfg(
     return record_dataset(
         out,
         recording.settings(),
-        partial(_record_shard, recording, out),
+        _Shards(recording, out),
         episodes_per_shard=EPISODES_PER_SHARD,
         episode_s=EPISODE_STEPS * STEP_S,
         workers=workers,
@@ -80,18 +80,29 @@ def record_sumocfg(
     )
 
 
-def _record_shard(recording: OwnRecording, out: Path, shard: int) -> int:
-    """Record one shard, if it is not there already, and return its number of windows."""
-    if not has_tables(out, shard):
-        episodes = range(shard * EPISODES_PER_SHARD, (shard + 1) * EPISODES_PER_SHARD)
-        tables = [_simulate_episode(recording, episode) for episode in episodes]
-        trajectories, drivers = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
-        write_tables(out, shard, trajectories, drivers.astype({"trait": "category"}))
-    found = recorded_windows(out, shard)
-    if found == 0:
-        first = f"the first {EPISODE_STEPS * STEP_S:g} s"
-        raise InputError(f"{recording.config.file}: nobody drives in {first}; let it begin when there is traffic")
-    return found
+@dataclass(frozen=True)
+class _Shards:
+    """The shards of a recording."""
+
+    recording: OwnRecording
+    out: Path
+
+    def paths(self, number: int) -> tuple[str, ...]:
+        return tuple(shard_path(table, number) for table in TABLES)
+
+    def __call__(self, number: int) -> ShardContents:
+        if not has_tables(self.out, number):
+            episodes = range(number * EPISODES_PER_SHARD, (number + 1) * EPISODES_PER_SHARD)
+            tables = [_simulate_episode(self.recording, episode) for episode in episodes]
+            trajectories, drivers = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
+            write_tables(self.out, number, trajectories, drivers.astype({"trait": "category"}))
+        found = shard_contents(self.out, number)
+        if found.windows == 0:
+            first = f"the first {EPISODE_STEPS * STEP_S:g} s"
+            raise InputError(
+                f"{self.recording.config.file}: nobody drives in {first}; let it begin when there is traffic"
+            )
+        return found
 
 
 class _Row(NamedTuple):

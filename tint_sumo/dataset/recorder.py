@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +11,17 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import Population, Share, find_population, population_name
 from tint_sumo.dataset.fcd import write_fcd
-from tint_sumo.dataset.schema import FCD, SCHEMA_VERSION, TABLES, TRAJECTORIES, read_shard, shard_file
+from tint_sumo.dataset.schema import FCD, SCHEMA_VERSION, TABLES, TRAJECTORIES, read_shard, shard_file, shard_path
 from tint_sumo.dataset.shards import (
     EPISODE_STEPS,
+    ShardContents,
     has_tables,
     record_dataset,
-    recorded_windows,
     require_sizes,
+    shard_contents,
     write_tables,
 )
+from tint_sumo.executors import Workers
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
 from tint_sumo.scenes.geometry import Floats, Numbers
 from tint_sumo.scenes.layout import layout
@@ -70,7 +71,7 @@ def record(
     population: str | Population | None = None,
     seed: int = 0,
     scene: str | Scene = T_INTERSECTION,
-    workers: int = 1,
+    workers: Workers = 1,
     fcd: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
@@ -89,32 +90,51 @@ def record(
         return record_dataset(
             out,
             recording.settings(),
-            partial(_record_shard, recording, out, fcd),
+            _Shards(recording, fcd, out),
             episodes_per_shard=EPISODES_PER_SHARD,
             episode_s=EPISODE_STEPS * recording.played().step_s,
-            parts=(*TABLES, FCD) if fcd else TABLES,
+            parts=_parts(fcd),
             workers=workers,
             progress=progress,
         )
     finally:
-        _simulation.cache_clear()  # ends the simulation: libsumo is free again
+        _simulations.clear()  # ends the simulation: libsumo is free again
 
 
-def _record_shard(recording: Recording, out: Path, fcd: bool, shard: int) -> int:
-    """Record one shard, as far as it is not there already, and return its number of windows."""
-    if not has_tables(out, shard):
-        simulation, first_episode = _simulation(recording.played()), shard * EPISODES_PER_SHARD
-        write_tables(out, shard, *simulate_episodes(simulation, recording.seed, first_episode))
-    if fcd and not shard_file(out, FCD, shard).exists():
-        rows = read_shard(shard_file(out, TRAJECTORIES, shard))
-        write_fcd(rows, shard_file(out, FCD, shard), layout(recording.played()))
-    return recorded_windows(out, shard)
+def _parts(fcd: bool) -> tuple[str, ...]:
+    return (*TABLES, FCD) if fcd else TABLES
 
 
-@cache
+@dataclass(frozen=True)
+class _Shards:
+    """The shards of a recording."""
+
+    recording: Recording
+    fcd: bool
+    out: Path
+
+    def paths(self, number: int) -> tuple[str, ...]:
+        return tuple(shard_path(part, number) for part in _parts(self.fcd))
+
+    def __call__(self, number: int) -> ShardContents:
+        if not has_tables(self.out, number):
+            simulation, first_episode = _simulation(self.recording.played()), number * EPISODES_PER_SHARD
+            write_tables(self.out, number, *simulate_episodes(simulation, self.recording.seed, first_episode))
+        if self.fcd and not shard_file(self.out, FCD, number).exists():
+            rows = read_shard(shard_file(self.out, TRAJECTORIES, number))
+            write_fcd(rows, shard_file(self.out, FCD, number), layout(self.recording.played()))
+        return shard_contents(self.out, number)
+
+
+_simulations: dict[Scene, Simulation] = {}  # this process's, one at most: libsumo runs no more
+
+
 def _simulation(scene: Scene) -> Simulation:
     """This process's simulation; starting one for every shard would cost more than recording it."""
-    return Simulation(EPISODES_PER_SHARD, scene, with_ego=False)
+    if scene not in _simulations:
+        _simulations.clear()
+        _simulations[scene] = Simulation(EPISODES_PER_SHARD, scene, with_ego=False)
+    return _simulations[scene]
 
 
 def simulate_episodes(

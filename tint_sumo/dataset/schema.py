@@ -60,8 +60,13 @@ DRIVER_SCHEMA = pa.schema(
 )
 
 
+def shard_path(part: str, shard: int) -> str:
+    """A shard's file, relative to the dataset's folder."""
+    return f"{part}/shard-{shard:05d}.{_SUFFIX[part]}"
+
+
 def shard_file(folder: Path, part: str, shard: int) -> Path:
-    return folder / part / f"shard-{shard:05d}.{_SUFFIX[part]}"
+    return folder / shard_path(part, shard)
 
 
 def shard_number(file: Path) -> int:

@@ -1,17 +1,14 @@
-"""The shards of a dataset while it is recorded: in any number of processes, interruptible and exactly resumable.
+"""The shards of a dataset while it is recorded: by any number of workers, interruptible and exactly resumable.
 
 A shard is a fixed number of episodes whose seeds follow from the dataset's seed and the shard's number, so that the
 dataset does not depend on the number of workers, and an interrupted recording resumes to the very same dataset. No more
 than a shard per process is in memory at a time.
 """
 
-import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 import pyarrow as pa
@@ -31,8 +28,8 @@ from tint_sumo.dataset.schema import (
     shard_number,
 )
 from tint_sumo.errors import InputError
+from tint_sumo.executors import Executor, Work, Workers, executor_of
 from tint_sumo.files import claim_folder, read_json, whole_file, write_json
-from tint_sumo.processes import SPAWN, end_with_parent
 from tint_sumo.progress import make_bar
 from tint_sumo.provenance import versions
 
@@ -43,6 +40,14 @@ _WINDOWS_KEY = b"tint_sumo.windows"
 # repeat are not built in vain. zstd 3 then beats snappy (0.52), lz4 (0.46) and gzip in size; zstd 9 saves 4 % for
 # twice the time; delta encodings save nothing. All of them read in about the same time.
 _FLOATS = [field.name for field in (*TRAJECTORY_SCHEMA, *DRIVER_SCHEMA) if pa.types.is_floating(field.type)]
+
+
+class ShardContents(NamedTuple):
+    """What is in a shard."""
+
+    windows: int
+    rows: int
+    drivers: int
 
 
 def require_sizes(windows: int, seed: int) -> None:
@@ -56,12 +61,12 @@ def require_sizes(windows: int, seed: int) -> None:
 def record_dataset(
     out: Path,
     settings: Mapping[str, Any],
-    record_shard: Callable[[int], int],
+    shards: Work[ShardContents],
     *,
     episodes_per_shard: int,
     episode_s: float,
     parts: Sequence[str] = TABLES,
-    workers: int = 1,
+    workers: Workers = 1,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Record shards into ``out`` until they hold enough windows, or go on with that; the dataset's manifest.
@@ -69,27 +74,26 @@ def record_dataset(
     Args:
         out: a new folder, or the one of this very recording.
         settings: what the dataset follows from; ``windows`` tells how many windows are enough.
-        record_shard: records a shard by its number, as far as it is not there already, and returns its windows.
+        shards: records a shard by its number, as far as it is not there already.
         episodes_per_shard, episode_s: what a shard consists of.
         parts: what each shard has in ``out``.
-        workers: processes that simulate.
+        workers: processes that simulate, or an executor.
         progress: show a progress bar on stderr.
 
     Raises:
         InputError: ``out`` holds another run, or the number of workers makes no sense.
     """
-    if workers < 1:
-        raise InputError(f"workers must be at least 1, not {workers}")
+    executor = executor_of(workers)
     with claim_folder(out, settings, with_versions=False):  # the manifest has them
         finished = _finished(out, parts)
         if finished is not None:
             return finished
-        counts = _record(out, settings["windows"], record_shard, workers, progress)
+        found = _record(out, settings["windows"], shards, executor, progress)
         manifest = {
             **settings,
-            **_contents(out, counts),
+            **_contents(found),
             "windows_asked_for": settings["windows"],
-            "episodes": len(counts) * episodes_per_shard,
+            "episodes": len(found) * episodes_per_shard,
             "episode_s": episode_s,
         }
         write_json(out / MANIFEST, manifest)
@@ -105,47 +109,21 @@ def _finished(out: Path, parts: Sequence[str]) -> dict[str, Any] | None:
     return manifest if all(shard_file(out, part, shard).exists() for part in parts for shard in shards) else None
 
 
-def _record(out: Path, windows: int, record_shard: Callable[[int], int], workers: int, progress: bool) -> list[int]:
-    """The number of windows in each shard."""
-    counts: list[int] = []
+def _record(
+    out: Path, windows: int, shards: Work[ShardContents], executor: Executor, progress: bool
+) -> list[ShardContents]:
+    found: list[ShardContents] = []
     with (
         make_bar(total=windows, desc="record", unit=" windows", disable=not progress) as bar,
-        _shards(record_shard, workers) as shards,
+        executor.map(shards, count()) as recorded,
     ):
-        for found in shards:
-            counts.append(found)
-            bar.update(min(found, windows - bar.n))
-            if sum(counts) >= windows:
+        for shard in recorded:
+            found.append(shard)
+            bar.update(min(shard.windows, windows - bar.n))
+            if sum(one.windows for one in found) >= windows:
                 break
-    _remove_shards_from(out, len(counts))
-    return counts
-
-
-@contextmanager
-def _shards(record_shard: Callable[[int], int], workers: int) -> Iterator[Iterator[int]]:
-    """Window counts of shards 0, 1, ..., recorded here or, ahead of their use, in worker processes."""
-    if workers == 1:
-        yield map(record_shard, count())
-        return
-    with ProcessPoolExecutor(workers, SPAWN, initializer=_start_worker) as pool:
-        try:
-            yield _ahead(pool, record_shard, workers)
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _ahead(pool: ProcessPoolExecutor, record_shard: Callable[[int], int], workers: int) -> Iterator[int]:
-    pending: list[Future[int]] = []
-    for shard in count():
-        pending.append(pool.submit(record_shard, shard))
-        if len(pending) > workers:
-            yield pending.pop(0).result()
-
-
-def _start_worker() -> None:
-    """Leave Ctrl-C to the main process, and go with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    _remove_shards_from(out, len(found))
+    return found
 
 
 def _remove_shards_from(out: Path, first: int) -> None:
@@ -156,19 +134,15 @@ def _remove_shards_from(out: Path, first: int) -> None:
                 file.unlink()
 
 
-def _contents(out: Path, counts: Sequence[int]) -> dict[str, Any]:
+def _contents(shards: Sequence[ShardContents]) -> dict[str, Any]:
     """What a manifest tells of the shards."""
-    rows = {
-        part: sum(read_shard_metadata(shard_file(out, part, shard)).num_rows for shard in range(len(counts)))
-        for part in TABLES
-    }
     return {
-        "windows": sum(counts),
+        "windows": sum(one.windows for one in shards),
         "window_steps": WINDOW_STEPS,
         "no_leader_gap_m": NO_LEADER_GAP_M,
-        "rows": rows[TRAJECTORIES],
-        "drivers": rows[DRIVERS],
-        "shards": len(counts),
+        "rows": sum(one.rows for one in shards),
+        "drivers": sum(one.drivers for one in shards),
+        "shards": len(shards),
         "versions": versions(("tint_sumo", "libsumo", "numpy", "pandas", "pyarrow")),
     }
 
@@ -177,9 +151,10 @@ def has_tables(out: Path, shard: int) -> bool:
     return all(shard_file(out, part, shard).exists() for part in TABLES)
 
 
-def recorded_windows(out: Path, shard: int) -> int:
-    """How many windows a shard has, as its file tells."""
-    return int(read_shard_metadata(shard_file(out, TRAJECTORIES, shard)).metadata[_WINDOWS_KEY])
+def shard_contents(out: Path, shard: int) -> ShardContents:
+    """What is in a shard, as its files tell."""
+    trajectories, drivers = (read_shard_metadata(shard_file(out, table, shard)) for table in TABLES)
+    return ShardContents(int(trajectories.metadata[_WINDOWS_KEY]), trajectories.num_rows, drivers.num_rows)
 
 
 def write_tables(out: Path, shard: int, trajectories: pd.DataFrame, drivers: pd.DataFrame) -> None:

@@ -25,7 +25,10 @@ class CeilingJob:
 
     name = "ceilings"
     title = Title("ceilings")
-    needs: tuple[str, ...] = ()
+    needs = ()
+    inputs = ()
+    outputs = (CEILINGS_FILE,)
+    uses_gpu = False
 
     def is_done(self) -> bool:
         return (self.out / CEILINGS_FILE).exists()

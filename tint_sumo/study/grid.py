@@ -5,6 +5,7 @@ from pathlib import Path
 
 from tint_sumo.dataset.recorder import record
 from tint_sumo.errors import InputError
+from tint_sumo.executors import Job, Workers, executor_of
 from tint_sumo.files import claim_folder
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, digest_of, find_scene
 from tint_sumo.study.budgets import Budget
@@ -13,7 +14,6 @@ from tint_sumo.study.loading import shipped_policies
 from tint_sumo.study.methods import Learned, find_method
 from tint_sumo.study.page import write_page
 from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
-from tint_sumo.study.pool import Job, run_jobs
 from tint_sumo.study.report import StudyReport, write_report
 from tint_sumo.study.trait_job import DATASET, SEED, TraitJob
 
@@ -37,7 +37,7 @@ def plan(budget: Budget, out: Path, scene: str | Scene = T_INTERSECTION) -> list
 
 
 def run_study(
-    budget: Budget, out: Path, *, scene: str | Scene = T_INTERSECTION, workers: int = 2, progress: bool = True
+    budget: Budget, out: Path, *, scene: str | Scene = T_INTERSECTION, workers: Workers = 2, progress: bool = True
 ) -> StudyReport:
     """Run the study into ``out``; what an earlier, interrupted call has finished is not repeated.
 
@@ -45,14 +45,14 @@ def run_study(
         budget: sizes of all stages.
         out: a new folder, or the one of this very study.
         scene: where everybody drives; the shipped policies, which know the paper's scene, are tested there alone.
-        workers: processes at a time.
+        workers: processes at a time, or an executor.
         progress: show progress bars on stderr.
 
     Raises:
         InputError: ``out`` holds another run, the scene does not fit the budget, or a stage was refused.
+        JobError: jobs were given up; all others are done.
     """
-    if workers < 1:
-        raise InputError(f"workers must be at least 1, not {workers}")
+    executor = executor_of(workers)
     _require_scene(budget, scene)
     jobs = plan(budget, out, scene)
     place = {} if scene == T_INTERSECTION else described(scene)
@@ -64,11 +64,11 @@ def run_study(
                 p_conservative=budget.record_p_conservative,
                 seed=SEED,
                 scene=scene,
-                workers=workers,
+                workers=executor,
                 progress=progress,
             )
-        run_jobs(jobs, workers, progress)
-        return write_page(write_report(out), out, workers=workers, progress=progress)
+        executor.run(jobs, progress)
+        return write_page(write_report(out), out, workers=executor, progress=progress)
 
 
 def _require_scene(budget: Budget, scene: str | Scene) -> None:

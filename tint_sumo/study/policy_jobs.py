@@ -10,6 +10,7 @@ import torch
 from tint_sumo.config import PpoSettings, Share, ends, share_words
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
+from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import write_json
 from tint_sumo.progress import Report, part_of
 from tint_sumo.scenes import T_INTERSECTION, AnyScene
@@ -18,9 +19,9 @@ from tint_sumo.study.budgets import Conditions, Trials
 from tint_sumo.study.evaluation import Evaluation, evaluate
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import METHODS, Rule, find_learned, find_method
-from tint_sumo.study.pool import THREADS_PER_JOB
 from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Measured, Result
 from tint_sumo.study.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
+from tint_sumo.study.trait_job import trait_folder
 
 CASES = 0  # the set of cases that all policies are tested on
 _SMOOTHED = 5  # points of a learning curve
@@ -38,6 +39,8 @@ class TrainJob:
     out: Path  # folder of the study
     scene: AnyScene = T_INTERSECTION
 
+    uses_gpu = True
+
     @property
     def name(self) -> str:
         return f"train {label(self.method, self.mix, self.seed)}"
@@ -54,11 +57,21 @@ class TrainJob:
         return traits + shared
 
     @property
-    def folder(self) -> Path:
-        return self._folder(self.method)
+    def inputs(self) -> tuple[str, ...]:
+        method = find_learned(self.method)
+        traits = (trait_folder(method.encoder),) if method.encoder and not self.shipped_traits else ()
+        return traits + ((self._folder(method.trained_as),) if method.trained_as else ())
 
-    def _folder(self, method: str) -> Path:
-        return self.out / "policies" / label(method, self.mix, self.seed)
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return (self._folder(self.method),)
+
+    @property
+    def folder(self) -> Path:
+        return self.out / self._folder(self.method)
+
+    def _folder(self, method: str) -> str:
+        return policy_folder(method, self.mix, self.seed)
 
     def is_done(self) -> bool:
         return (self.folder / f"{POLICY}.json").exists()
@@ -66,9 +79,9 @@ class TrainJob:
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
         method = find_learned(self.method)
-        traits = None if self.shipped_traits else self.out / "traits" / str(method.encoder) / "model.safetensors"
+        traits = None if self.shipped_traits else self.out / trait_folder(str(method.encoder)) / "model.safetensors"
         if method.trained_as is not None:
-            share_training(self._folder(method.trained_as), self.method, self.folder, traits)
+            share_training(self.out / self._folder(method.trained_as), self.method, self.folder, traits)
             return f"shares the training of {method.trained_as}"
         train_policy(
             self.method,
@@ -95,6 +108,8 @@ class EvaluateJob:
     out: Path  # folder of the study
     scene: AnyScene = T_INTERSECTION
 
+    uses_gpu = False
+
     @property
     def name(self) -> str:
         return f"evaluate {self._label}"
@@ -114,8 +129,16 @@ class EvaluateJob:
         return () if self.mix is None else (f"train {self._label}",)
 
     @property
+    def inputs(self) -> tuple[str, ...]:
+        return () if self.mix is None else (policy_folder(self.method, self.mix, self.seed),)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return (f"{RESULTS}/{self._label}.json",)
+
+    @property
     def result_file(self) -> Path:
-        return self.out / RESULTS / f"{self._label}.json"
+        return self.out / self.outputs[0]
 
     def is_done(self) -> bool:
         return self.result_file.exists()
@@ -162,11 +185,16 @@ def label(method: str, mix: Share | None, seed: int) -> str:
     return f"{method}-P{low:g}-seed{seed}" if low == high else f"{method}-P{low:g}to{high:g}-seed{seed}"
 
 
+def policy_folder(method: str, mix: Share, seed: int) -> str:
+    """Folder of a policy that a study trains, relative to the study's."""
+    return f"policies/{label(method, mix, seed)}"
+
+
 def policy_path(out: Path, method: str, mix: Share | None, seed: int, percent: int = 100) -> str | Path:
     """Where a policy of the study in ``out`` is after some percent of its training; the name of one that was given."""
     if mix is None:
         return method
-    return snapshot_stem(out / "policies" / label(method, mix, seed), percent).with_suffix(".safetensors")
+    return snapshot_stem(out / policy_folder(method, mix, seed), percent).with_suffix(".safetensors")
 
 
 def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:

@@ -13,13 +13,13 @@ from tint_sumo import traits
 from tint_sumo.config import CONSERVATIVE_LABEL, TraitSettings
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, joined, load_drivers, load_labels, load_windows, split_by_episode
-from tint_sumo.errors import InputError
+from tint_sumo.executors import Job, Workers, executor_of
+from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import claim_folder, read_json, write_json, write_text
 from tint_sumo.progress import Report
 from tint_sumo.scenes import SCENES, T_INTERSECTION
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import TRAIT_BUDGETS
-from tint_sumo.study.pool import THREADS_PER_JOB, Job, run_jobs
 from tint_sumo.study.tables import markdown_table
 from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, fit_line
 from tint_sumo.traits.model import find_trait_method
@@ -27,6 +27,7 @@ from tint_sumo.traits.training import train
 
 SPEED = "desired_speed_mps"
 _RESULTS = "results"
+_POPULATIONS = ("traits", "continuous")
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class SceneStudy:
 SCENE_STUDIES = {"full": SceneStudy()}
 
 
-def run_scene_study(study: SceneStudy, out: Path, *, workers: int = 2, progress: bool = True) -> pd.DataFrame:
+def run_scene_study(study: SceneStudy, out: Path, *, workers: Workers = 2, progress: bool = True) -> pd.DataFrame:
     """Run the comparison into ``out``; what an earlier, interrupted call has finished is not repeated.
 
     Each model is trained on one scene, the T-intersection, or on all. A linear classifier, and a line for the desired
@@ -57,22 +58,22 @@ def run_scene_study(study: SceneStudy, out: Path, *, workers: int = 2, progress:
 
     Raises:
         InputError: ``out`` holds another run, or a stage was refused.
+        JobError: jobs were given up; all others are done.
     """
-    if workers < 1:
-        raise InputError(f"workers must be at least 1, not {workers}")
+    executor = executor_of(workers)
     with claim_folder(out, {"kind": "scene study", **asdict(study)}):
         for number, scene in enumerate(study.scenes):
-            for population in ("traits", "continuous"):
+            for population in _POPULATIONS:
                 record(
-                    _data(out, scene, population),
+                    out / _data(scene, population),
                     study.windows,
                     population=population,
                     seed=study.recording_seed + number,
                     scene=scene,
-                    workers=workers,
+                    workers=executor,
                     progress=progress,
                 )
-        run_jobs(plan(study, out), workers, progress)
+        executor.run(plan(study, out), progress)
         return _report(out)
 
 
@@ -87,8 +88,8 @@ def plan(study: SceneStudy, out: Path) -> list[Job]:
     ]
 
 
-def _data(out: Path, scene: str, population: str) -> Path:
-    return out / f"{population}-{scene}"
+def _data(scene: str, population: str) -> str:
+    return f"{population}-{scene}"
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,7 @@ class TransferJob:
     out: Path
 
     needs = ()
+    uses_gpu = False
 
     @property
     def name(self) -> str:
@@ -116,8 +118,16 @@ class TransferJob:
         return self.trained_on[0] if len(self.trained_on) == 1 else "all"
 
     @property
+    def inputs(self) -> tuple[str, ...]:
+        return tuple(_data(scene, population) for scene in self.study.scenes for population in _POPULATIONS)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return f"models/{self.name}", f"{_RESULTS}/{self.name}.json"
+
+    @property
     def _result_file(self) -> Path:
-        return self.out / _RESULTS / f"{self.name}.json"
+        return self.out / self.outputs[1]
 
     def is_done(self) -> bool:
         return self._result_file.exists()
@@ -143,7 +153,7 @@ class TransferJob:
         model = train(
             windows,
             self.study.settings,
-            self.out / "models" / self.name,
+            self.out / self.outputs[0],
             method=self.method,
             seed=self.seed,
             conservative=labels == CONSERVATIVE_LABEL if find_trait_method(self.method).uses_labels else None,
@@ -156,7 +166,7 @@ class TransferJob:
         """Training or test windows of some scenes, and the labels of their drivers."""
         parts, labels = [], []
         for scene in scenes:
-            data = _data(self.out, scene, "traits")
+            data = self.out / _data(scene, "traits")
             windows, chosen = self._chosen(data, test)
             parts.append(windows[chosen])
             labels.append(load_labels(data, windows)[chosen])
@@ -166,7 +176,7 @@ class TransferJob:
         """The same for drivers without classes, and their desired speeds."""
         parts, speeds_mps = [], []
         for scene in scenes:
-            data = _data(self.out, scene, "continuous")
+            data = self.out / _data(scene, "continuous")
             windows, chosen = self._chosen(data, test)
             parts.append(windows[chosen])
             speeds_mps.append(load_drivers(data, windows, [SPEED])[SPEED].to_numpy(np.float64)[chosen])

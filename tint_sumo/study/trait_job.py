@@ -6,15 +6,20 @@ from pathlib import Path
 import torch
 
 from tint_sumo.config import TraitSettings
+from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import write_json
 from tint_sumo.progress import Report
 from tint_sumo.standings import Title
-from tint_sumo.study.pool import THREADS_PER_JOB
 from tint_sumo.study.trait_models import evaluate_traits, plot_traits, train_traits
 from tint_sumo.traits.storage import add_to_card
 
 DATASET = "dataset"  # folder of the dataset in a study's folder
 SEED = 0  # seed of the dataset and of the trait models
+
+
+def trait_folder(method: str) -> str:
+    """Folder of a trait model that a study trains, relative to the study's."""
+    return f"traits/{method}"
 
 
 @dataclass(frozen=True)
@@ -25,6 +30,10 @@ class TraitJob:
     settings: TraitSettings
     out: Path  # folder of the study
 
+    needs = ()
+    inputs = (DATASET,)
+    uses_gpu = False
+
     @property
     def name(self) -> str:
         return f"traits {self.method}"
@@ -34,12 +43,12 @@ class TraitJob:
         return Title("traits", self.method)
 
     @property
-    def needs(self) -> tuple[str, ...]:
-        return ()
+    def outputs(self) -> tuple[str, ...]:
+        return (trait_folder(self.method),)
 
     @property
     def folder(self) -> Path:
-        return self.out / "traits" / self.method
+        return self.out / trait_folder(self.method)
 
     def is_done(self) -> bool:
         return (self.folder / "evaluation.json").exists()

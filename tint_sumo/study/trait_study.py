@@ -10,12 +10,12 @@ import torch
 from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows, split_by_episode
-from tint_sumo.errors import InputError
+from tint_sumo.executors import Job, Workers, executor_of
+from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import claim_folder, write_json
 from tint_sumo.progress import Report, part_of
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import TRAIT_BUDGETS
-from tint_sumo.study.pool import THREADS_PER_JOB, Job, run_jobs
 from tint_sumo.study.results import RESULTS
 from tint_sumo.study.trait_models import train_on_split
 from tint_sumo.study.trait_report import TraitReport, write_trait_report
@@ -25,6 +25,7 @@ from tint_sumo.traits.storage import RUN_MODEL, add_to_card
 
 DATASET_SEED = 2022
 PROPERTIES = ("desired_speed_mps", "min_gap_m")
+_DATA, _CONTINUOUS_DATA = "dataset", "continuous"  # folders in a comparison's folder
 
 
 @dataclass(frozen=True)
@@ -49,37 +50,37 @@ class TraitStudy:
 TRAIT_STUDIES = {"full": TraitStudy()}
 
 
-def run_trait_study(study: TraitStudy, out: Path, *, workers: int = 2, progress: bool = True) -> TraitReport:
+def run_trait_study(study: TraitStudy, out: Path, *, workers: Workers = 2, progress: bool = True) -> TraitReport:
     """Run the comparison into ``out``; what an earlier, interrupted call has finished is not repeated.
 
     Args:
         study: sizes of all stages.
         out: a new folder, or the one of this very study.
-        workers: processes at a time.
+        workers: processes at a time, or an executor.
         progress: show progress bars on stderr.
 
     Raises:
         InputError: ``out`` holds another run, or a stage was refused.
+        JobError: jobs were given up; all others are done.
     """
-    if workers < 1:
-        raise InputError(f"workers must be at least 1, not {workers}")
+    executor = executor_of(workers)
     for method in study.methods:
         find_trait_method(method)
     with claim_folder(out, {"kind": "trait study", **asdict(study)}):
         for folder, windows, p_conservative in _recordings(study, out):
             record(
-                folder, windows, p_conservative=p_conservative, seed=DATASET_SEED, workers=workers, progress=progress
+                folder, windows, p_conservative=p_conservative, seed=DATASET_SEED, workers=executor, progress=progress
             )
         if study.continuous_methods:
             record(
-                out / "continuous",
+                out / _CONTINUOUS_DATA,
                 study.continuous_windows,
                 population="continuous",
                 seed=DATASET_SEED,
-                workers=workers,
+                workers=executor,
                 progress=progress,
             )
-        run_jobs(plan(study, out), workers, progress)
+        executor.run(plan(study, out), progress)
         return write_trait_report(out)
 
 
@@ -97,12 +98,12 @@ def plan(study: TraitStudy, out: Path) -> list[Job]:
 
 def _recordings(study: TraitStudy, out: Path) -> list[tuple[Path, int, float]]:
     """Folder, windows and P(conservative) of each recording."""
-    others = [(_other_data(out, p), study.other_windows, p) for p in study.other_p]
-    return [(out / "dataset", study.windows, study.p_conservative), *others]
+    others = [(out / _other_data(p), study.other_windows, p) for p in study.other_p]
+    return [(out / _DATA, study.windows, study.p_conservative), *others]
 
 
-def _other_data(out: Path, p_conservative: float) -> Path:
-    return out / f"dataset-P{p_conservative:g}"
+def _other_data(p_conservative: float) -> str:
+    return f"{_DATA}-P{p_conservative:g}"
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,9 @@ class CompareJob:
     seed: int
     out: Path
 
+    needs = ()
+    uses_gpu = False
+
     @property
     def name(self) -> str:
         return f"{self.method} seed{self.seed}"
@@ -123,21 +127,25 @@ class CompareJob:
         return Title("compare", self.method, seed=self.seed)
 
     @property
-    def needs(self) -> tuple[str, ...]:
-        return ()
+    def inputs(self) -> tuple[str, ...]:
+        return (_DATA, *map(_other_data, self.study.other_p))
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return tuple(path for noise_m in self.study.noises_m for path in (self._model(noise_m), self._result(noise_m)))
 
     def is_done(self) -> bool:
-        return all(self._result_file(noise_m).exists() for noise_m in self.study.noises_m)
+        return all((self.out / self._result(noise_m)).exists() for noise_m in self.study.noises_m)
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        windows, conservative = _load(self.out / "dataset")
-        others = {p: _load(_other_data(self.out, p)) for p in self.study.other_p}
+        windows, conservative = _load(self.out / _DATA)
+        others = {p: _load(self.out / _other_data(p)) for p in self.study.other_p}
         noises_m = self.study.noises_m
         train, _ = split_by_episode(windows, TEST_FRACTION, self.seed)
         seen = self.study.settings.epochs * len(train)  # windows of a training
         for done, noise_m in enumerate(noises_m):
-            if not self._result_file(noise_m).exists():
+            if not (self.out / self._result(noise_m)).exists():
                 part = part_of(report, done * seen, len(noises_m) * seen)
                 self._compare(noise_m, windows, conservative, others, part)
         return f"{len(noises_m)} noise levels"
@@ -150,12 +158,12 @@ class CompareJob:
         others: dict[float, tuple[Windows, np.ndarray]],
         report: Report,
     ) -> None:
-        folder = self.out / "models" / _slug(self.method, noise_m, self.seed)
+        folder = self.out / self._model(noise_m)
         train, test = split_by_episode(windows, TEST_FRACTION, self.seed)
         resumes = folder.exists()
         began = time.perf_counter()
         settings = replace(self.study.settings, noise_m=noise_m)
-        data = self.out / "dataset"
+        data = self.out / _DATA
         model = train_on_split(
             data, windows, folder, method=self.method, settings=settings, seed=self.seed, report=report
         )
@@ -174,10 +182,13 @@ class CompareJob:
             "by_p": by_p,
         }
         add_to_card(folder / f"{RUN_MODEL}.safetensors", {"accuracy": found.accuracy})
-        write_json(self._result_file(noise_m), content)
+        write_json(self.out / self._result(noise_m), content)
 
-    def _result_file(self, noise_m: float) -> Path:
-        return self.out / RESULTS / f"{_slug(self.method, noise_m, self.seed)}.json"
+    def _model(self, noise_m: float) -> str:
+        return f"models/{_slug(self.method, noise_m, self.seed)}"
+
+    def _result(self, noise_m: float) -> str:
+        return f"{RESULTS}/{_slug(self.method, noise_m, self.seed)}.json"
 
 
 @dataclass(frozen=True)
@@ -190,6 +201,10 @@ class ContinuousJob:
     seed: int
     out: Path
 
+    needs = ()
+    inputs = (_CONTINUOUS_DATA,)
+    uses_gpu = False
+
     @property
     def name(self) -> str:
         return f"{self.method} continuous {self.latent_size} latents seed{self.seed}"
@@ -199,20 +214,21 @@ class ContinuousJob:
         return Title(f"continuous, {self.latent_size} latents", self.method, seed=self.seed)
 
     @property
-    def needs(self) -> tuple[str, ...]:
-        return ()
+    def outputs(self) -> tuple[str, ...]:
+        slug = self.name.replace(" ", "-")
+        return f"models/{slug}", f"{RESULTS}/{slug}.json"
 
     @property
     def result_file(self) -> Path:
-        return self.out / RESULTS / f"{self.name.replace(' ', '-')}.json"
+        return self.out / self.outputs[1]
 
     def is_done(self) -> bool:
         return self.result_file.exists()
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        data = self.out / "continuous"
-        folder = self.out / "models" / self.name.replace(" ", "-")
+        data = self.out / _CONTINUOUS_DATA
+        folder = self.out / self.outputs[0]
         windows = load_windows(data)
         model = train_on_split(
             data,

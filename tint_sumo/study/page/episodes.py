@@ -9,6 +9,7 @@ from typing import Any
 
 from tint_sumo.config import share_words
 from tint_sumo.errors import InputError
+from tint_sumo.executors import Workers
 from tint_sumo.scenes import Scene
 from tint_sumo.study.evaluation import Case
 from tint_sumo.study.methods import METHODS
@@ -36,7 +37,7 @@ class Recordings:
     refusals: tuple[str, ...]  # why policies are not among them
 
 
-def record_episodes(out: Path, scene: str | Scene, choice: Choice, *, workers: int, progress: bool) -> Recordings:
+def record_episodes(out: Path, scene: str | Scene, choice: Choice, *, workers: Workers, progress: bool) -> Recordings:
     """Record the chosen cases of all policies that can be loaded, as far as they are not there already.
 
     Raises:
@@ -52,7 +53,7 @@ def record_episodes(out: Path, scene: str | Scene, choice: Choice, *, workers: i
             refusals.append(f"{one.title}: {error}")
         else:
             ready.append((one, recording))
-    record_all([recording for _, recording in ready], workers, progress)
+    record_all([recording for _, recording in ready], out, workers, progress)
     recorded = tuple(Recorded(one, read_episodes(recording.file)) for one, recording in ready)
     return Recordings(scene, choice, recorded, tuple(refusals))
 

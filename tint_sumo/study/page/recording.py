@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 import tint_sumo
 from tint_sumo.config import Share
 from tint_sumo.errors import InputError
+from tint_sumo.executors import Workers, executor_of
+from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import read_json, write_text
 from tint_sumo.policy.storage import read_policy_card, weights_file
 from tint_sumo.progress import Progress, Report, part_of
@@ -23,8 +25,7 @@ from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.driving import Moment, drive_case
 from tint_sumo.study.loading import Contender, find_policy, load_policy
 from tint_sumo.study.methods import METHODS, Rule
-from tint_sumo.study.policy_jobs import CASES, label, policy_path
-from tint_sumo.study.pool import THREADS_PER_JOB, run_jobs
+from tint_sumo.study.policy_jobs import CASES, label, policy_folder, policy_path
 from tint_sumo.study.trait_reader import TraitReader, fit_reader
 
 EPISODES = "episodes"  # folder of the recorded episodes in a study's folder
@@ -65,8 +66,18 @@ class Recording:
         return label(self.method, self.mix, self.seed)
 
     @property
+    def inputs(self) -> tuple[str, ...]:
+        """The policy's folder, relative to the study's, if the study has trained it."""
+        return () if self.mix is None else (policy_folder(self.method, self.mix, self.seed),)
+
+    @property
+    def path(self) -> str:
+        """The file, relative to the study's folder."""
+        return f"{EPISODES}/{self.label}.json"
+
+    @property
     def file(self) -> Path:
-        return self.out / EPISODES / f"{self.label}.json"
+        return self.out / self.path
 
     def require_policy(self) -> None:
         """Raise InputError unless there is a policy that can be loaded."""
@@ -117,9 +128,11 @@ class RecordJob:
     """Make several recordings in one process: each alone would cost more time to start than to record."""
 
     number: int
-    recordings: tuple[Recording, ...]
+    recordings: tuple[Recording, ...]  # they are made in this job's folder, whatever their own
+    out: Path  # folder of the study
 
     needs = ()
+    uses_gpu = False
 
     @property
     def name(self) -> str:
@@ -129,12 +142,24 @@ class RecordJob:
     def title(self) -> Title:
         return Title("record", self.name)
 
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return tuple(path for one in self.recordings for path in one.inputs)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return tuple(one.path for one in self.recordings)
+
     def is_done(self) -> bool:
-        return all(one.is_done() for one in self.recordings)
+        return not self._missing()
+
+    def _missing(self) -> list[Recording]:
+        placed = [replace(one, out=self.out) for one in self.recordings]
+        return [one for one in placed if not one.is_done()]
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        missing = [one for one in self.recordings if not one.is_done()]
+        missing = self._missing()
         total, done = sum(len(one.cases) for one in missing), 0
         for one in missing:
             one.make(part_of(report, done, total))
@@ -142,10 +167,12 @@ class RecordJob:
         return f"policies: {len(missing)}"
 
 
-def record_all(recordings: Sequence[Recording], workers: int, progress: bool) -> None:
-    """Make the recordings that are not there yet, with up to ``workers`` processes."""
+def record_all(recordings: Sequence[Recording], out: Path, workers: Workers, progress: bool) -> None:
+    """Make the recordings of the study in ``out`` that are not there yet."""
+    executor = executor_of(workers)
     missing = tuple(one for one in recordings if not one.is_done())
-    run_jobs([RecordJob(number, missing[number::workers]) for number in range(workers)], workers, progress)
+    count = min(executor.slots, len(missing))
+    executor.run([RecordJob(number, missing[number::count], out) for number in range(count)], progress)
 
 
 def read_episodes(file: Path) -> dict[int, dict[str, Any]]:

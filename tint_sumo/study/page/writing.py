@@ -12,6 +12,7 @@ from typing import Any
 from plotly.offline import get_plotlyjs
 
 import tint_sumo
+from tint_sumo.executors import Workers
 from tint_sumo.files import RUN_FILE, read_json, write_text
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, read_described
 from tint_sumo.study.page.charts import Chart, curve_chart, outcome_chart, world_charts
@@ -42,7 +43,7 @@ class _Study:
     latents: dict[str, Any] | None
 
 
-def write_page(report: StudyReport, out: Path, *, workers: int = 2, progress: bool = True) -> StudyReport:
+def write_page(report: StudyReport, out: Path, *, workers: Workers = 2, progress: bool = True) -> StudyReport:
     """Write report.html into a study's folder: one file that needs no network.
 
     The episodes it shows are recorded first, into ``episodes`` there; what is recorded already is not repeated.
@@ -50,7 +51,7 @@ def write_page(report: StudyReport, out: Path, *, workers: int = 2, progress: bo
     Args:
         report: of the study.
         out: the study's folder.
-        workers: processes at a time that record.
+        workers: processes at a time that record, or an executor.
         progress: show progress bars on stderr.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Jobs for tests of the pool; run as a program, a pool that must be interrupted unless its jobs are short."""
+"""Jobs for tests of executors; run as a program, jobs that must be interrupted unless they are short."""
 
 import os
 import sys
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tint_sumo.errors import InputError
+from tint_sumo.executors import Local
 from tint_sumo.files import write_text
 from tint_sumo.progress import Progress, Report
 from tint_sumo.standings import Title
-from tint_sumo.study.pool import run_jobs
 
 
 @dataclass(frozen=True)
@@ -18,14 +18,29 @@ class FileJob:
     """Writes its start and end into files named after it; ``patience_s`` lies between them."""
 
     name: str
-    folder: Path
+    out: Path
     needs: tuple[str, ...] = ()
     reports: int = 1
     patience_s: float = 0.0
     failure: str = ""
 
+    uses_gpu = False
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return tuple(f"{one}.done" for one in self.needs)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return tuple(f"{self.name}.{state}" for state in ("pid", "tries", "interrupted", "done"))
+
     def path(self, state: str) -> Path:
-        return self.folder / f"{self.name}.{state}"
+        return self.out / f"{self.name}.{state}"
+
+    @property
+    def tries(self) -> int:
+        """How often it was begun."""
+        return int(self.path("tries").read_text()) if self.path("tries").exists() else 0
 
     @property
     def title(self) -> Title:
@@ -36,19 +51,20 @@ class FileJob:
 
     def run(self, report: Report) -> str:
         write_text(self.path("pid"), str(os.getpid()))
+        write_text(self.path("tries"), str(self.tries + 1))
         for done in range(self.reports):
             report(Progress(done, self.reports, "line", {"success": 0.5}))
             time.sleep(0.3 * (self.reports > 1))
         if self.failure == "refused":
             raise InputError("this is not for me")
-        if self.failure == "died":
+        if self.failure == "died" or (self.failure == "died once" and self.tries == 1):
             os._exit(7)
         try:
             time.sleep(self.patience_s)
         except KeyboardInterrupt:
             write_text(self.path("interrupted"), "")
             raise
-        missing = [one for one in self.needs if not (self.folder / f"{one}.done").exists()]
+        missing = [one for one in self.needs if not (self.out / f"{one}.done").exists()]
         write_text(self.path("done"), " ".join(missing))
         return "written"
 
@@ -57,6 +73,6 @@ if __name__ == "__main__":
     folder, is_short = Path(sys.argv[1]), "short" in sys.argv
     times = {"reports": 3} if is_short else {"patience_s": 60.0}
     try:
-        run_jobs([FileJob(name, folder, **times) for name in ("first", "second")], workers=2)
+        Local(2).run([FileJob(name, folder, **times) for name in ("first", "second")])
     except KeyboardInterrupt:
         sys.exit(130)

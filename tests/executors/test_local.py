@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.study.jobs import FileJob
-from tint_sumo.errors import InputError
-from tint_sumo.study.pool import run_jobs
+from tests.executors.jobs import FileJob
+from tint_sumo.errors import InputError, JobError
+from tint_sumo.executors import Local
 
 PATIENCE_S = 60.0
 STATES = ("begins", "written")
@@ -35,7 +35,7 @@ def is_alive(pid: int) -> bool:
 @pytest.fixture
 def pool(tmp_path: Path) -> Iterator["subprocess.Popen[bytes]"]:
     """A program with two jobs in progress that take long."""
-    process = subprocess.Popen([sys.executable, "-m", "tests.study.jobs", str(tmp_path)])
+    process = subprocess.Popen([sys.executable, "-m", "tests.executors.jobs", str(tmp_path)])
     pids = [tmp_path / f"{name}.pid" for name in ("first", "second")]
     wait_until(lambda: all(path.exists() for path in pids))
     yield process
@@ -45,7 +45,7 @@ def pool(tmp_path: Path) -> Iterator["subprocess.Popen[bytes]"]:
 
 def test_jobs_wait_for_what_they_need(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     jobs = [FileJob("last", tmp_path, needs=("base", "other")), FileJob("base", tmp_path), FileJob("other", tmp_path)]
-    run_jobs(jobs, workers=2)
+    Local(2).run(jobs)
     assert [job.path("done").read_text() for job in jobs] == ["", "", ""]
     told = re.sub(r" \(\d+ s\)", "", capsys.readouterr().err).splitlines()
     assert sorted(told[:4]) == sorted([f"{name}: {state}" for name in ("base", "other") for state in STATES])
@@ -55,28 +55,56 @@ def test_jobs_wait_for_what_they_need(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_done_jobs_are_left_alone(tmp_path: Path) -> None:
     jobs = [FileJob("base", tmp_path), FileJob("last", tmp_path, needs=("base",))]
     (tmp_path / "base.done").write_text("")
-    run_jobs(jobs, workers=1, progress=False)
+    Local(1).run(jobs, progress=False)
     assert not jobs[0].path("pid").exists()
     assert jobs[1].is_done()
 
 
 @pytest.mark.parametrize(
-    ("failure", "error", "message"),
-    [("refused", InputError, "bad: this is not for me"), ("died", RuntimeError, "bad ended with exit code 7")],
+    ("failure", "error", "tries"),
+    [("refused", InputError, 1), ("died", JobError, 3)],
 )
-def test_a_failure_ends_the_others(tmp_path: Path, failure: str, error: type[Exception], message: str) -> None:
-    long = FileJob("long", tmp_path, patience_s=PATIENCE_S)
-    with pytest.raises(error, match=message):
-        run_jobs([long, FileJob("bad", tmp_path, failure=failure)], workers=2, progress=False)
-    assert not long.is_done()
-    assert not long.path("pid").exists() or not is_alive(int(long.path("pid").read_text()))
+def test_a_job_that_fails_is_named_and_the_others_finish(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], failure: str, error: type[Exception], tries: int
+) -> None:
+    bad, good = FileJob("bad", tmp_path, failure=failure), FileJob("good", tmp_path)
+    needing = [FileJob("child", tmp_path, needs=("bad",)), FileJob("grandchild", tmp_path, needs=("child",))]
+    with pytest.raises(error) as caught:
+        Local(1).run([bad, good, *needing])
+    reason = "this is not for me" if failure == "refused" else "ended with exit code 7"
+    told = "" if failure == "refused" else "jobs failed: "
+    assert str(caught.value) == (
+        f"{told}bad: {reason}; skipped, because they need these: child, grandchild. "
+        "All other jobs are done; the same command tries these again"
+    )
+    assert (bad.tries, good.is_done(), needing[0].tries) == (tries, True, 0)
+    lines = capsys.readouterr().err.splitlines()
+    assert f"bad: {error_word(failure)}, {tries} of {tries} times: {reason}" in lines
+    assert "grandchild: skipped, because it needs a job that was given up" in lines
+
+
+def error_word(failure: str) -> str:
+    return "refused" if failure == "refused" else "failed"
+
+
+def test_a_job_that_fails_once_is_tried_again(tmp_path: Path) -> None:
+    job = FileJob("bad", tmp_path, failure="died once")
+    Local(1).run([job, FileJob("child", tmp_path, needs=("bad",))], progress=False)
+    assert (job.tries, job.is_done()) == (2, True)
+
+
+def test_what_a_job_prints_is_in_its_log(tmp_path: Path) -> None:
+    with pytest.raises(InputError):
+        Local(1).run([FileJob("bad", tmp_path, failure="refused")], progress=False)
+    assert (tmp_path / "logs" / "bad.log").read_text() == "this is not for me\n"
 
 
 def test_an_interruption_reaches_the_jobs(pool: "subprocess.Popen[bytes]", tmp_path: Path) -> None:
     pool.send_signal(signal.SIGINT)
     assert pool.wait(PATIENCE_S) == 130
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {f"{name}.{state}" for name in ("first", "second") for state in ("pid", "interrupted")}
+    states = ("pid", "tries", "interrupted")
+    assert names == {"logs", *(f"{name}.{state}" for name in ("first", "second") for state in states)}
 
 
 def test_a_killed_pool_leaves_nobody_behind(pool: "subprocess.Popen[bytes]", tmp_path: Path) -> None:

@@ -1,0 +1,90 @@
+"""Work in processes of this machine."""
+
+import signal
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from multiprocessing import connection
+from typing import TypeVar
+
+from tint_sumo.errors import InputError
+from tint_sumo.executors.jobs import Begun, Ended, Job, News, Work, run_jobs
+from tint_sumo.executors.process import JobProcess
+from tint_sumo.processes import SPAWN, end_with_parent
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Local:
+    """An executor of so many processes; a single one does pieces of work in this very process."""
+
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise InputError(f"workers must be at least 1, not {self.workers}")
+
+    @property
+    def slots(self) -> int:
+        return self.workers
+
+    def run(self, jobs: Sequence[Job], progress: bool = True) -> None:
+        run_jobs(jobs, _Processes(self.workers), progress)
+
+    @contextmanager
+    def map(self, work: Work[T], numbers: Iterable[int]) -> Iterator[Iterator[T]]:
+        if self.workers == 1:
+            yield map(work, numbers)
+            return
+        with ProcessPoolExecutor(self.workers, SPAWN, initializer=_start_worker) as pool:
+            try:
+                yield _ahead(pool, work, numbers, self.workers)
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+@dataclass
+class _Processes:
+    """A host of so many jobs at a time."""
+
+    room: int
+    _begun: list[Job] = field(default_factory=list)  # jobs of which nothing was told yet
+    _running: list[JobProcess] = field(default_factory=list)
+
+    def start(self, job: Job) -> None:
+        self._running.append(JobProcess(job))
+        self._begun.append(job)
+
+    def listen(self, patience_s: float) -> list[tuple[Job, News]]:
+        if self._begun:
+            begun, self._begun = self._begun, []
+            return [(job, Begun()) for job in begun]
+        heard = connection.wait([one.pipe for one in self._running], patience_s)
+        news: list[tuple[Job, News]] = [(one.job, one.receive()) for one in self._running if one.pipe in heard]
+        ended = [job for job, one in news if isinstance(one, Ended)]
+        self._running = [one for one in self._running if one.job not in ended]
+        return news
+
+    def interrupt(self) -> None:
+        for one in self._running:
+            one.interrupt()
+        for one in self._running:
+            one.join()
+
+
+def _ahead(pool: ProcessPoolExecutor, work: Work[T], numbers: Iterable[int], workers: int) -> Iterator[T]:
+    pending: list[Future[T]] = []
+    for number in numbers:
+        pending.append(pool.submit(work, number))
+        if len(pending) > workers:
+            yield pending.pop(0).result()
+    for future in pending:
+        yield future.result()
+
+
+def _start_worker() -> None:
+    """Leave Ctrl-C to the main process, and go with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()

@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from filelock import FileLock, Timeout
@@ -38,9 +38,18 @@ def whole_file(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def write_text(path: Path, text: str) -> None:
+def is_temporary(path: PurePath) -> bool:
+    """Whether a file is an unfinished one or a lock: nothing that a run leaves."""
+    return path.suffix == ".partial" or path.name == LOCK_FILE
+
+
+def write_bytes(path: Path, content: bytes) -> None:
     with whole_file(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_bytes(content)
+
+
+def write_text(path: Path, text: str) -> None:
+    write_bytes(path, text.encode("utf-8"))
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
@@ -122,7 +131,7 @@ def _is_strange(entry: Path) -> bool:
     """Whether a folder's entry is none that a run leaves that was killed at its very beginning."""
     if entry.name == CONFIG_FILE:  # one of the user's own is not overwritten
         return not entry.with_name(PROVENANCE_FILE).exists()
-    return entry.suffix != ".partial" and entry.name not in (LOCK_FILE, PROVENANCE_FILE)
+    return not is_temporary(entry) and entry.name != PROVENANCE_FILE
 
 
 def _write_provenance(folder: Path, with_versions: bool) -> None:

@@ -3,8 +3,8 @@
 import io
 import json
 import sys
-from collections.abc import Sequence
-from contextlib import redirect_stdout, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -37,6 +37,7 @@ from tint_sumo.structures import Where
 
 if TYPE_CHECKING:
     from tint_sumo.config import Share
+    from tint_sumo.executors import Workers
     from tint_sumo.study.loading import Contender
     from tint_sumo.study.report import StudyReport
 
@@ -72,6 +73,37 @@ class Command:
 
     def run(self) -> Outcome:
         raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpreadCommand(Command):
+    """A command whose work many machines can share."""
+
+    executor: Literal["local", "ray"] = "local"
+    """local: this machine; ray: a Ray cluster, with the same results (needs tint_sumo[ray])."""
+    address: str = "auto"
+    """Address of the Ray cluster, ray://HOST:10001; auto: the cluster that this machine is a node of or, if there is
+    none, Ray on this machine alone."""
+
+    @contextmanager
+    def workers_of(self, workers: int, gpus_per_job: float = 0.0) -> "Iterator[Workers]":
+        """In the block, what does the work: so many processes, or the cluster."""
+        if self.executor == "local":
+            for flag, value, default in (("address", self.address, "auto"), ("gpus-per-job", gpus_per_job, 0.0)):
+                if value != default:
+                    raise InputError(f"--{flag} goes with --executor ray; add that, or leave it out")
+            yield workers
+            return
+        try:
+            from tint_sumo.executors.cluster import ray_cluster
+        except ModuleNotFoundError as error:
+            if error.name != "ray":
+                raise
+            raise InputError('--executor ray needs Ray; install it: pip install "tint_sumo[ray]"') from None
+        with ray_cluster(self.address, gpus_per_job) as found:
+            if found.dashboard_url:
+                print(f"Ray's dashboard: http://{found.dashboard_url}", file=sys.stderr)
+            yield found
 
 
 # What is a name among the flags can be defined in a configuration file.
@@ -145,7 +177,7 @@ class Net(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Record(Command):
+class Record(SpreadCommand):
     """Record a dataset of traffic without the ego vehicle; the same command resumes an interrupted recording."""
 
     after_interrupt: ClassVar[str] = RESUMES
@@ -163,7 +195,7 @@ class Record(Command):
     """Seed of the traffic."""
     scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
     workers: int = 1
-    """Processes that simulate; the dataset does not depend on their number."""
+    """Processes of this machine that simulate; the dataset does not depend on their number."""
     format: Literal["parquet", "fcd"] = "parquet"
     """Parquet is always written; fcd: SUMO's floating-car data, too, also for a dataset that is there already."""
     sumocfg: Path | None = None
@@ -179,21 +211,24 @@ class Record(Command):
             self._require_nothing_but_the_configuration()
             manifest = record_sumocfg(sumocfg, self.out, self.windows, seed=self.seed, workers=self.workers)
             return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
-        manifest = record(
-            self.out,
-            self.windows,
-            p_conservative=_share(self.p_conservative),
-            population=self.population,
-            seed=self.seed,
-            scene=self.scene,
-            workers=self.workers,
-            fcd=self.format == "fcd",
-        )
+        with self.workers_of(self.workers) as workers:
+            manifest = record(
+                self.out,
+                self.windows,
+                p_conservative=_share(self.p_conservative),
+                population=self.population,
+                seed=self.seed,
+                scene=self.scene,
+                workers=workers,
+                fcd=self.format == "fcd",
+            )
         return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
 
     def _require_nothing_but_the_configuration(self) -> None:
         flags = ["p_conservative", "population", "format"]
         other = "the sumocfg of a scene"
+        if self.executor != "local":
+            raise InputError("a .sumocfg is on this machine alone; use --executor local")
         if self.sumocfg is not None:
             flags.append("scene")
             other = "--sumocfg"
@@ -353,7 +388,7 @@ class InferTraits(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyTraits(Command):
+class StudyTraits(SpreadCommand):
     """Compare all trait methods at every position noise, an hour's work; the same command resumes it."""
 
     after_interrupt: ClassVar[str] = RESUMES
@@ -363,12 +398,13 @@ class StudyTraits(Command):
     budget: TraitStudyValue = "full"
     """Sizes of all stages; others can be given in a configuration file."""
     workers: int = 2
-    """Processes at a time."""
+    """Processes of this machine at a time."""
 
     def run(self) -> Outcome:
         from tint_sumo.study.trait_study import run_trait_study
 
-        report = run_trait_study(_TRAIT_STUDY.full(self.budget), self.out, workers=self.workers)
+        with self.workers_of(self.workers) as workers:
+            report = run_trait_study(_TRAIT_STUDY.full(self.budget), self.out, workers=workers)
         files = [str(file) for file in (report.csv_file, report.markdown_file, report.figure_file)]
         text = "\n".join([report.markdown, *(f"wrote {file}" for file in files)])
         return Outcome(text, {"results": report.table.to_dict("records"), "files": files})
@@ -435,7 +471,7 @@ class TrainPolicy(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluatePolicy(Command):
+class EvaluatePolicy(SpreadCommand):
     """Evaluate a policy on unseen cases, which are the same for every policy; rates are fractions of episodes."""
 
     model: str
@@ -461,19 +497,25 @@ class EvaluatePolicy(Command):
         from tint_sumo.envs.rows import OUTCOMES
         from tint_sumo.progress import progress_bar
         from tint_sumo.study.evaluation import evaluate
+        from tint_sumo.study.evaluation_jobs import evaluate_on
         from tint_sumo.study.loading import load_policy
 
         _use_one_thread()
-        contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
+        given = {"scene": self.scene, "allow_pickle": self.allow_pickle}
+        contender = load_policy(self.model, **given)
         world = _world(contender, self.p_conservative, self.noise, self.tau)
-        with progress_bar(self.model) as report:
-            evaluation = evaluate(
-                contender.policy,
-                lambda num_envs: contender.make_venv(num_envs, **world),
-                self.episodes,
-                self.seed,
-                report=report,
-            )
+        with self.workers_of(1) as workers:
+            if isinstance(workers, int):
+                with progress_bar(self.model) as report:
+                    evaluation = evaluate(
+                        contender.policy,
+                        lambda num_envs: contender.make_venv(num_envs, **world),
+                        self.episodes,
+                        self.seed,
+                        report=report,
+                    )
+            else:
+                evaluation = evaluate_on(workers, self.model, contender, world, self.episodes, self.seed, **given)
         rates = {outcome: evaluation.rate(outcome) for outcome in OUTCOMES}
         lines = [
             f"{outcome:9} {rate.value:6.1%}  (95 % interval {rate.interval[0]:.1%} to {rate.interval[1]:.1%})"
@@ -486,7 +528,7 @@ class EvaluatePolicy(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunStudy(Command):
+class RunStudy(SpreadCommand):
     """Record, learn traits, train and evaluate every method, report; the same command resumes an interrupted study."""
 
     after_interrupt: ClassVar[str] = RESUMES
@@ -498,13 +540,16 @@ class RunStudy(Command):
     """Folder of the study; runs/<budget> if not given."""
     scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
     workers: int = 2
-    """Processes at a time."""
+    """Processes of this machine at a time."""
+    gpus_per_job: float = 0.0
+    """Share of a GPU for each training, with --executor ray and where the cluster has GPUs."""
 
     def run(self) -> Outcome:
         from tint_sumo.study.grid import run_study
 
         out = self._folder()
-        report = run_study(_BUDGET.full(self.budget), out, scene=self.scene, workers=self.workers)
+        with self.workers_of(self.workers, self.gpus_per_job) as workers:
+            report = run_study(_BUDGET.full(self.budget), out, scene=self.scene, workers=workers)
         outcome = _report_outcome(report)
         made = [
             out / "dataset",
@@ -547,7 +592,7 @@ class StudyScenes(Command):
     budget: SceneStudyValue = "full"
     """Sizes of all stages; others can be given in a configuration file."""
     workers: int = 2
-    """Processes at a time."""
+    """Processes of this machine at a time."""
 
     def run(self) -> Outcome:
         from tint_sumo.study.scene_study import report_markdown, run_scene_study

@@ -76,16 +76,24 @@ def require_seed(seed: int) -> None:
         raise InputError(f"seed must lie in 0 to {MAX_SEED}, not {seed}")
 
 
+def require_cases(episodes: int, seed: int, first: int = 0) -> None:
+    """Raise InputError unless a set of cases has so many, from the case ``first`` on."""
+    require_seed(seed)
+    if not 1 <= episodes <= CASES_PER_SEED - first:
+        raise InputError(f"episodes must lie in 1 to {CASES_PER_SEED}, not {episodes}")
+
+
 def evaluate(
     policy: Policy,
     make_venv: Callable[[int], VecEnv],
     episodes: int,
     seed: int,
     *,
+    first: int = 0,
     batch: int = BATCH,
     report: Report = silent,
 ) -> Evaluation:
-    """Run ``policy`` with its likeliest actions through the cases 0, 1, ... of the set ``seed``.
+    """Run ``policy`` with its likeliest actions through the cases ``first``, ``first + 1``, ... of the set ``seed``.
 
     Case i is the first episode of an environment seeded with ``case_seed(seed, i)``, whatever the method and the batch.
 
@@ -94,22 +102,21 @@ def evaluate(
         make_venv: makes the vector environment of so many environments; closed at the end.
         episodes: number of cases.
         seed: which set of cases, 0 to 1000.
+        first: number of the first case.
         batch: environments at a time.
         report: told of the progress.
 
     Raises:
         InputError: no episodes, too many, or a seed out of range.
     """
-    require_seed(seed)
-    if not 1 <= episodes <= CASES_PER_SEED:
-        raise InputError(f"episodes must lie in 1 to {CASES_PER_SEED}, not {episodes}")
+    require_cases(episodes, seed, first)
     cases: dict[int, Case] = {}
     venv = make_venv(min(batch, episodes))
     try:
-        for first in range(0, episodes, venv.num_envs):
-            wanted = min(venv.num_envs, episodes - first)
-            for index, case in _first_episodes(policy, venv, case_seed(seed, first), wanted):
-                cases[first + index] = case
+        for done in range(0, episodes, venv.num_envs):
+            wanted = min(venv.num_envs, episodes - done)
+            for index, case in _first_episodes(policy, venv, case_seed(seed, first + done), wanted):
+                cases[done + index] = case
                 report(Progress(len(cases), episodes, "case", _shares(cases.values())))
     finally:
         venv.close()

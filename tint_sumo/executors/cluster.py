@@ -1,0 +1,351 @@
+"""Work on a Ray cluster (https://docs.ray.io); the only module that imports Ray.
+
+No disk is shared. A job's inputs, and what it has left so far, travel through Ray's object store to a scratch folder of
+the node that does it, and what changes among its outputs travels back every few seconds, so that a job whose node dies
+is begun again with its last checkpoint. Pieces of work travel likewise, as a whole.
+"""
+
+import logging
+import os
+import tempfile
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import ray
+from ray.exceptions import RayError, RayTaskError
+
+import tint_sumo
+from tint_sumo.changes import Changes, file_states, read_files, write_files
+from tint_sumo.errors import InputError, JobError
+from tint_sumo.executors.jobs import MAX_FAILURES, MAX_LOSSES, Begun, Ended, Job, News, Work, run_jobs
+from tint_sumo.executors.process import INTERRUPT_S, JobProcess, log_path
+from tint_sumo.processes import Told, told
+from tint_sumo.progress import Progress
+
+T = TypeVar("T")
+
+LOOK_INTERVAL_S = 2.0  # so often a job's outputs are looked at, and its news sent
+PIECES_PER_CPU = 2  # pieces that are done or wait on a CPU: nobody is idle while results travel
+_HEAD = {"node:__internal_head__": 0.001}  # Ray's resource that only the head node has
+
+_ALLOWED = {"refused": 1, "failed": MAX_FAILURES, "lost": MAX_LOSSES}
+
+Files = Mapping[str, bytes | None]  # contents by path relative to a folder
+
+
+@contextmanager
+def ray_cluster(address: str = "auto", gpus_per_job: float = 0.0) -> Iterator["RayCluster"]:
+    """In the block, an executor on the Ray cluster at an address.
+
+    Args:
+        address: ``ray://host:port`` of a cluster, ``host:port`` of one that this machine is a node of, or ``"auto"``:
+            the cluster that this machine is a node of or, if there is none, Ray on this machine alone, which then
+            listens on 127.0.0.1 only.
+        gpus_per_job: share of a GPU that each job has that a GPU makes faster, if the cluster has GPUs.
+
+    Raises:
+        InputError: there is no cluster at the address, or no such share of a GPU.
+    """
+    if not 0.0 <= gpus_per_job < float("inf"):
+        raise InputError(f"gpus_per_job must be 0 or more, not {gpus_per_job:g}")
+    dashboard_url = _connect(address)
+    try:
+        yield RayCluster(gpus_per_job, dashboard_url)
+    except RayError as error:
+        raise JobError(f"the Ray cluster failed ({_first_line(error)}); the same command goes on") from None
+    finally:
+        ray.shutdown()
+
+
+def _connect(address: str) -> str:
+    """Connect this process; where the cluster's dashboard is."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody is told of what runs here
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
+    try:
+        context = ray.init(address, **options)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        if address != "auto":
+            raise InputError(f"no Ray cluster answers at {address} ({_first_line(error)}); check --address") from None
+        context = ray.init("local", _node_ip_address="127.0.0.1", **options)
+    return context.dashboard_url or ""
+
+
+def _resources() -> dict[str, float]:
+    """All that the cluster's nodes have."""
+    found: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
+    return found
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].strip()
+
+
+@dataclass(frozen=True)
+class RayCluster:
+    """An executor; ``ray_cluster`` makes one."""
+
+    gpus_per_job: float = 0.0
+    dashboard_url: str = ""  # where Ray shows what the cluster does; empty where it does not
+
+    @property
+    def slots(self) -> int:
+        return max(1, int(_resources().get("CPU", 1)))
+
+    def run(self, jobs: Sequence[Job], progress: bool = True) -> None:
+        run_jobs(jobs, _Tasks(self.gpus_per_job), progress)
+
+    @contextmanager
+    def map(self, work: Work[T], numbers: Iterable[int]) -> Iterator[Iterator[T]]:
+        pending: deque[_Piece[T]] = deque()
+        try:
+            yield self._ahead(work, iter(numbers), pending)
+        finally:
+            for piece in pending:
+                piece.cancel()
+
+    def _ahead(self, work: Work[T], numbers: Iterator[int], pending: "deque[_Piece[T]]") -> Iterator[T]:
+        while True:
+            for number in numbers:
+                pending.append(_Piece(work, number))
+                if len(pending) >= PIECES_PER_CPU * self.slots:
+                    break
+            if not pending:
+                return
+            yield pending[0].result()
+            pending.popleft()
+
+
+class _Piece(Generic[T]):
+    """A piece of work on its way."""
+
+    def __init__(self, work: Work[T], number: int) -> None:
+        self._work = work
+        self._number = number
+        self._ends: Counter[str] = Counter()  # how often it was lost, and failed
+        paths = work.paths(number)
+        # What is there already need not travel.
+        self._is_here = bool(paths) and all((work.out / path).exists() for path in paths)
+        self._task: Any = None if self._is_here else self._submit()
+
+    def _submit(self) -> Any:
+        files = read_files(self._work.out, self._work.paths(self._number))
+        return _do_piece.remote(self._work, self._number, files, tint_sumo.__version__)
+
+    def result(self) -> T:
+        """Wait for what it gives.
+
+        Raises:
+            InputError, JobError: it was refused, or it failed or was lost again and again.
+        """
+        if self._is_here:
+            return self._work(self._number)
+        while True:
+            how, content = self._wait()
+            if how == "done":
+                return content  # type: ignore[no-any-return]
+            if how == "refused":
+                raise InputError(str(content))
+            self._ends[how] += 1
+            if self._ends[how] >= _ALLOWED[how]:
+                reason = str(content).strip().splitlines()[-1]
+                raise JobError(f"piece {self._number} {how} {self._ends[how]} times: {reason}")
+            self._task = self._submit()
+
+    def _wait(self) -> tuple[str, Any]:
+        try:
+            message, files = ray.get(self._task)
+        except RayError as error:
+            return _lost_or_failed(error)
+        write_files(self._work.out, files)
+        return message  # type: ignore[no-any-return]
+
+    def cancel(self) -> None:
+        if self._task is not None:
+            ray.cancel(self._task, force=True)
+
+
+def _lost_or_failed(error: RayError) -> tuple[str, str]:
+    """What became of a task that has returned nothing: it raised an error, or went with its machine."""
+    if isinstance(error, RayTaskError):
+        return "failed", str(error.cause)
+    return "lost", _first_line(error)
+
+
+@ray.remote(num_cpus=1, max_retries=0)  # pieces that are lost are counted, and submitted with what is there by then
+def _do_piece(work: Work[Any], number: int, files: Files, version: str) -> tuple[Told, Files]:
+    """Do a piece in a scratch folder that holds some files; what came out, and the files that it has left."""
+    with tempfile.TemporaryDirectory(prefix="tint_sumo-") as scratch:
+        folder = Path(scratch)
+        write_files(folder, files)
+        changes = Changes(folder, work.paths(number))
+        return told(lambda: _placed(work, folder, version)(number)), changes.take()
+
+
+def _placed(work: Any, folder: Path, version: str) -> Any:
+    """A job, or pieces of work, in another folder.
+
+    Raises:
+        InputError: this node has another version of the package than the driver, and might do another thing.
+    """
+    if version != tint_sumo.__version__:
+        raise InputError(
+            f"a node of the cluster has tint_sumo {tint_sumo.__version__}, and this machine has {version}; "
+            "install the same everywhere"
+        )
+    return replace(work, out=folder)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A job that was submitted."""
+
+    job: Job
+    ref: Any  # what it returns
+
+
+class _Tasks:
+    """A host whose jobs are tasks of Ray, which queues those that there is no room for yet."""
+
+    room = float("inf")
+
+    def __init__(self, gpus_per_job: float) -> None:
+        self._gpus_per_job = gpus_per_job if _resources().get("GPU", 0) > 0 else 0.0
+        self._mailbox = _Mailbox.remote()  # type: ignore[attr-defined]
+        self._numbers = count()
+        self._tasks: dict[int, _Task] = {}  # by number: what an earlier run of a job still tells does not count
+        self._begun: set[int] = set()
+        self._sent: dict[tuple[Path, tuple[int, int]], Any] = {}  # files in the object store, by path and state
+
+    def start(self, job: Job) -> None:
+        number = next(self._numbers)
+        files = {path: self._send(job.out / path, state) for path, state in file_states(job.out, _paths(job))}
+        task = _do_job.options(name=job.name, num_gpus=self._gpus_per_job if job.uses_gpu else 0.0)
+        ref = task.remote(job, number, list(files), list(files.values()), self._mailbox, tint_sumo.__version__)
+        self._tasks[number] = _Task(job, ref)
+
+    def _send(self, file: Path, state: tuple[int, int]) -> Any:
+        """A file in the object store; many jobs may read it."""
+        if (file, state) not in self._sent:
+            self._sent[file, state] = ray.put(file.read_bytes())
+        return self._sent[file, state]
+
+    def listen(self, patience_s: float) -> list[tuple[Job, News]]:
+        refs = {task.ref: number for number, task in self._tasks.items()}
+        if not refs:
+            return []
+        ended, _ = ray.wait(list(refs), num_returns=1, timeout=patience_s)
+        if ended:
+            ended, _ = ray.wait(list(refs), num_returns=len(refs), timeout=0)
+        # What a job tells, it tells before it ends.
+        news = [told for message in ray.get(self._mailbox.take.remote()) for told in self._read(*message)]
+        for ref in ended:
+            task = self._tasks.pop(refs[ref])
+            news.append((task.job, _end_of(task)))
+        return news
+
+    def _read(self, number: int, news: News | None, files: Files) -> list[tuple[Job, News]]:
+        if number not in self._tasks:
+            return []
+        if isinstance(news, Begun):
+            self._begun.add(number)
+        job = self._tasks[number].job
+        write_files(job.out, files)
+        return [] if news is None else [(job, news)]
+
+    def interrupt(self) -> None:
+        if not self._tasks:
+            return
+        ray.get(self._mailbox.stop.remote())
+        for number in self._tasks.keys() - self._begun:
+            ray.cancel(self._tasks[number].ref)
+        end_s = time.monotonic() + INTERRUPT_S
+        while self._tasks and time.monotonic() < end_s:
+            self.listen(1.0)
+        for task in self._tasks.values():
+            ray.cancel(task.ref, force=True)
+
+
+def _paths(job: Job) -> tuple[str, ...]:
+    """What a job reads, and what it goes on from."""
+    return (*job.inputs, *job.outputs, log_path(job.name))
+
+
+def _end_of(task: _Task) -> Ended:
+    try:
+        ended, files = ray.get(task.ref)
+    except RayError as error:
+        how, text = _lost_or_failed(error)
+        return Ended(how, text)  # type: ignore[arg-type]
+    write_files(task.job.out, files)
+    assert isinstance(ended, Ended)
+    return ended
+
+
+@ray.remote(num_cpus=0, resources=_HEAD)
+class _Mailbox:
+    """Holds what jobs tell until the driver takes it. It is on the head node, without which there is no cluster."""
+
+    def __init__(self) -> None:
+        self._messages: list[tuple[int, News | None, Files]] = []
+        self._is_over = False
+
+    def post(self, number: int, news: News | None, files: Files) -> bool:
+        """Leave a message; whether the job shall save its work and end."""
+        self._messages.append((number, news, files))
+        return self._is_over
+
+    def take(self) -> list[tuple[int, News | None, Files]]:
+        taken, self._messages = self._messages, []
+        return taken
+
+    def stop(self) -> None:
+        self._is_over = True
+
+
+@ray.remote(num_cpus=1, max_retries=0)  # jobs that are lost are counted, and submitted with their last checkpoint
+def _do_job(
+    job: Job, number: int, paths: Sequence[str], contents: Sequence[Any], mailbox: Any, version: str
+) -> tuple[Ended, Files]:
+    """Do a job in a scratch folder that holds some files; how it ended, and what it has left since its last message."""
+    with tempfile.TemporaryDirectory(prefix="tint_sumo-") as scratch:
+        folder = Path(scratch)
+        write_files(folder, dict(zip(paths, ray.get(list(contents)), strict=True)))
+        try:
+            placed = _placed(job, folder, version)
+        except InputError as error:
+            return Ended("refused", str(error)), {}
+        changes = Changes(folder, (*job.outputs, log_path(job.name)))
+
+        def post(news: News | None) -> bool:
+            return bool(ray.get(mailbox.post.remote(number, news, changes.take(time.time()))))
+
+        process = JobProcess(placed)
+        try:
+            ended = _attend(process, post)
+        finally:
+            process.interrupt()
+            process.join()
+        return ended, changes.take()
+
+
+def _attend(process: JobProcess, post: Callable[[News | None], bool]) -> Ended:
+    """Pass on what a job tells until it ends."""
+    latest: Progress | None = None
+    looked_s = time.monotonic()
+    post(Begun())
+    while True:
+        if process.pipe.poll(max(0.0, looked_s + LOOK_INTERVAL_S - time.monotonic())):
+            news = process.receive()
+            if isinstance(news, Ended):
+                return news
+            latest = news
+        else:
+            looked_s = time.monotonic()
+            if post(latest):
+                return Ended("lost", "interrupted")

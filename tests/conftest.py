@@ -1,12 +1,13 @@
 """Shared by all tests."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 import torch
 from hypothesis import settings
 
+from tests.s3 import empty_bucket, s3_server
 from tests.scenes.own_networks import OWN_NETWORKS, OwnNetwork
 
 settings.register_profile("tint_sumo", deadline=None)  # no test fails because the machine is busy
@@ -36,3 +37,21 @@ def own_network(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Own
         return made[name]
 
     return make
+
+
+@pytest.fixture(scope="session")
+def s3_endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of an S3 server on this machine."""
+    with s3_server(tmp_path_factory.mktemp("s3") / "log.txt") as endpoint:
+        yield endpoint
+
+
+@pytest.fixture
+def s3_url(s3_endpoint: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A folder in an empty bucket; the environment says where the server is and who asks."""
+    empty_bucket(s3_endpoint, "bucket")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", s3_endpoint)
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "tester")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+    monkeypatch.setenv("AWS_REGION", "us-east-1")
+    return "s3://bucket/folder"

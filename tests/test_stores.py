@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import re
 import signal
 import socket
 import subprocess
@@ -17,6 +18,7 @@ import pytest
 from tint_sumo import stores
 from tint_sumo.changes import Changes
 from tint_sumo.errors import InputError
+from tint_sumo.files import claim_folder
 from tint_sumo.stores import Store, is_url, working_folder
 
 
@@ -227,6 +229,17 @@ def test_what_is_there_is_sent_when_the_block_fails(file_url: str, error: type[B
         raise error("failed")
     assert Store(file_url).files() == {"a": 1}
     assert not folder.exists()
+
+
+def test_a_run_at_a_url_is_resumed_and_another_one_refused(url: str) -> None:
+    with working_folder(url) as folder, claim_folder(folder, {"seed": 1}):
+        (folder / "half").write_text("half")
+    with working_folder(url) as folder, claim_folder(folder, {"seed": 1}):
+        assert (folder / "half").read_text() == "half"
+    message = f"^{re.escape(url)} already holds another run"
+    with pytest.raises(InputError, match=message), working_folder(url) as folder, claim_folder(folder, {"seed": 2}):
+        pytest.fail("the block must not begin")
+    assert set(Store(url).files()) == {"half", "run.json"}
 
 
 def test_files_are_sent_while_the_block_runs(url: str, monkeypatch: pytest.MonkeyPatch) -> None:

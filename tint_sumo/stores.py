@@ -167,6 +167,11 @@ def working_folder(out: str | Path) -> Iterator[Path]:
         except _PushError as error:
             kept = folder.rename(f"{home}_not_sent")
             raise InputError(f"{error}; everything is kept in {kept}") from None
+        except InputError as error:
+            if str(folder) not in str(error):
+                raise
+            # the user knows the URL, not the folder
+            raise InputError(str(error).replace(str(folder), _without_secrets(store.url))) from None
 
 
 class _PushError(InputError):

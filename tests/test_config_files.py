@@ -24,6 +24,7 @@ COMMAND_LINES = (
     "net --replicas 3 --scene four_way --out some/net",
     "record --out data --windows 70 --p-conservative 0.2 0.8 --population continuous --format fcd --json",
     "record --out data --sumocfg mine.sumocfg",
+    "record --out s3://bucket/data --executor ray --address ray://head:10001",
     "dataset inspect data --figure picture.png",
     "traits train --data data --out model --method morton --budget paper --noise 0.1",
     "traits evaluate --data data --model vae --noise 1e-3 --other-scene",
@@ -103,7 +104,7 @@ def all_commands(*groups: type) -> Iterator[tuple[type, ...]]:
 def test_flags_win_over_the_file(tmp_path: Path) -> None:
     file = str(written(tmp_path, "out: here\nwindows: 50\nseed: 7\njson: true\np_conservative: [0.2, 0.8]"))
     found = parse(["record", "--config", file, "--seed", "3", "--json", "--out", "there"])
-    assert (found.out, found.windows, found.seed, found.p_conservative) == (Path("there"), 50, 3, (0.2, 0.8))
+    assert (found.out, found.windows, found.seed, found.p_conservative) == ("there", 50, 3, (0.2, 0.8))
     assert parse(["record", f"--config={file}", "--no-json"]).json is False
 
 
@@ -147,12 +148,12 @@ def test_a_budget_equal_to_a_known_one_is_that_one(tmp_path: Path) -> None:
         (
             "record",
             "out: data\nwindow: 5",
-            "line 2: window: there is no such setting; did you mean windows?; known are json, out",
+            "line 2: window: there is no such setting; did you mean windows?; known are json, executor",
         ),
         ("record", "windows: many", "line 1: windows: must be a whole number, not 'many'"),
         ("record", "windows: 1.5", "line 1: windows: must be a whole number, not 1.5"),
         ("record", "windows: true", "line 1: windows: must be a whole number, not True"),
-        ("record", "out: null", "line 1: out: must be a path, not None"),
+        ("record", "out: null", "line 1: out: must be text, not None"),
         ("record", "format: xml", "line 1: format: must be one of parquet, fcd, not 'xml'"),
         ("record", "p_conservative: x", "line 1: p_conservative: must be a list, each item a number, not 'x'"),
         ("record", "p_conservative:\n- 0.1\n- x", "line 3: p_conservative[1]: must be a number, not 'x'"),

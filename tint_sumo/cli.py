@@ -33,6 +33,7 @@ from tint_sumo.configuration import (
 )
 from tint_sumo.errors import InputError, JobError
 from tint_sumo.provenance import Origin, made_by
+from tint_sumo.stores import working_folder
 from tint_sumo.structures import Where
 
 if TYPE_CHECKING:
@@ -57,6 +58,11 @@ class Outcome:
 
     text: str
     content: dict[str, Any]
+
+    def naming(self, out: str, folder: Path) -> "Outcome":
+        """With the place that the user has named where the folder is named that stands for it."""
+        content = json.loads(json.dumps(self.content).replace(str(folder), out))
+        return Outcome(self.text.replace(str(folder), out), content)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,6 +150,10 @@ _TRAIT_BUDGET = one_of("tint_sumo.study.budgets", "TRAIT_BUDGETS", "quick")
 _TRAIT_STUDY = one_of("tint_sumo.study.trait_study", "TRAIT_STUDIES", "full")
 _SCENE_STUDY = one_of("tint_sumo.study.scene_study", "SCENE_STUDIES", "full")
 
+# A path would lose a slash of a URL.
+_PLACE = arg(metavar="FOLDER|URL")
+FolderOrUrl = Annotated[str, _PLACE]
+
 # Values are names, or what these make of a file.
 SceneValue = Annotated[Any, name_flag(), _SCENE]
 PopulationValue = Annotated[Any, name_flag("traits", "continuous"), _POPULATION]
@@ -182,8 +192,8 @@ class Record(SpreadCommand):
 
     after_interrupt: ClassVar[str] = RESUMES
 
-    out: Path
-    """Folder for the dataset."""
+    out: FolderOrUrl
+    """Folder for the dataset, or a URL such as s3://bucket/folder."""
     windows: int = 30_000
     """At least so many windows of up to 20 steps of 0.1 s."""
     p_conservative: ShareFlag = (0.5,)
@@ -393,8 +403,8 @@ class StudyTraits(SpreadCommand):
 
     after_interrupt: ClassVar[str] = RESUMES
 
-    out: Path = Path("runs/traits")
-    """Folder of the comparison."""
+    out: FolderOrUrl = "runs/traits"
+    """Folder of the comparison, or a URL such as s3://bucket/folder."""
     budget: TraitStudyValue = "full"
     """Sizes of all stages; others can be given in a configuration file."""
     workers: int = 2
@@ -403,11 +413,11 @@ class StudyTraits(SpreadCommand):
     def run(self) -> Outcome:
         from tint_sumo.study.trait_study import run_trait_study
 
-        with self.workers_of(self.workers) as workers:
-            report = run_trait_study(_TRAIT_STUDY.full(self.budget), self.out, workers=workers)
+        with working_folder(self.out) as out, self.workers_of(self.workers) as workers:
+            report = run_trait_study(_TRAIT_STUDY.full(self.budget), out, workers=workers)
         files = [str(file) for file in (report.csv_file, report.markdown_file, report.figure_file)]
         text = "\n".join([report.markdown, *(f"wrote {file}" for file in files)])
-        return Outcome(text, {"results": report.table.to_dict("records"), "files": files})
+        return Outcome(text, {"results": report.table.to_dict("records"), "files": files}).naming(self.out, out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -536,8 +546,8 @@ class RunStudy(SpreadCommand):
     budget: BudgetValue = "quick"
     """quick: minutes, few decisions. full: all methods, four seeds, three hours. paper: all numbers as in the paper,
     days."""
-    out: Path | None = None
-    """Folder of the study; runs/<budget> if not given."""
+    out: Annotated[str | None, _PLACE] = None
+    """Folder of the study, or a URL such as s3://bucket/folder; runs/<budget> if not given."""
     scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
     workers: int = 2
     """Processes of this machine at a time."""
@@ -547,24 +557,26 @@ class RunStudy(SpreadCommand):
     def run(self) -> Outcome:
         from tint_sumo.study.grid import run_study
 
-        out = self._folder()
-        with self.workers_of(self.workers, self.gpus_per_job) as workers:
-            report = run_study(_BUDGET.full(self.budget), out, scene=self.scene, workers=workers)
-        outcome = _report_outcome(report)
-        made = [
-            out / "dataset",
-            *sorted(out.glob("traits/*/latent.png")),
-            *sorted(out.glob("policies/*/policy.safetensors")),
-        ]
+        place = self._place()
+        with working_folder(place) as out:
+            with self.workers_of(self.workers, self.gpus_per_job) as workers:
+                report = run_study(_BUDGET.full(self.budget), out, scene=self.scene, workers=workers)
+            outcome = _report_outcome(report)
+            made = [
+                out / "dataset",
+                *sorted(out.glob("traits/*/latent.png")),
+                *sorted(out.glob("policies/*/policy.safetensors")),
+            ]
         lines = "\n".join(f"wrote {path}" for path in made)
-        return Outcome(f"{outcome.text}\n{lines}", {**outcome.content, "made": [str(path) for path in made]})
+        content = {**outcome.content, "made": [str(path) for path in made]}
+        return Outcome(f"{outcome.text}\n{lines}", content).naming(place, out)
 
-    def _folder(self) -> Path:
+    def _place(self) -> str:
         if self.out is not None:
             return self.out
         if not isinstance(self.budget, str):
             raise InputError("a budget of your own needs a folder of its own; say --out FOLDER")
-        return Path("runs") / self.budget
+        return f"runs/{self.budget}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -119,5 +119,5 @@ def write_command(command: Any) -> str:
     for name, value in values.items():
         named = _from_file(hints[name])
         values[name] = value if named is None else named.full(value)
-    helped = {name: mark.help for name, hint in hints.items() for mark in _marks(hint) if hasattr(mark, "help")}
+    helped = {name: mark.help for name, hint in hints.items() for mark in _marks(hint) if getattr(mark, "help", None)}
     return to_yaml(values, {**field_notes(type(command)), **helped})

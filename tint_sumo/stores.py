@@ -141,12 +141,13 @@ class Store:
 
 
 @contextmanager
-def working_folder(out: str | Path) -> Iterator[Path]:
+def working_folder(out: str | Path, without: tuple[str, ...] = ()) -> Iterator[Path]:
     """A folder of this machine that stands for ``out`` in the block: ``out`` itself unless it is a URL.
 
     For a URL it is a temporary folder that begins with the files of the store. While the block runs, the files that
     have changed are sent there every PUSH_INTERVAL_S, older ones first: where a file is, so are those that were written
-    before it. When the block ends, however it ends, the rest is sent. Temporary files and locks never are.
+    before it. When the block ends, however it ends, the rest is sent. Temporary files and locks never are. Folders
+    ``without`` are not fetched, and what is in them there stays.
 
     Raises:
         InputError: the store does not answer or refuses. Is that so at the end, the folder is kept; the message says
@@ -160,6 +161,8 @@ def working_folder(out: str | Path) -> Iterator[Path]:
         folder = Path(home) / "out"
         folder.mkdir()
         for path in store.files():
+            if path.split("/")[0] in without:
+                continue
             write_bytes(folder / path, store.read(path))
         try:
             with _pushing(store, folder):

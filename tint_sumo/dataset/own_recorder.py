@@ -56,11 +56,12 @@ class OwnRecording:
 
 
 def record_sumocfg(
-    sumocfg: Path, out: Path, windows: int, *, seed: int = 0, workers: int = 1, progress: bool = True
+    sumocfg: Path, out: str | Path, windows: int, *, seed: int = 0, workers: int = 1, progress: bool = True
 ) -> dict[str, Any]:
-    """Record at least ``windows`` windows of a configuration's traffic into ``out`` and return the manifest.
+    """Record at least ``windows`` windows of a configuration's traffic and return the manifest.
 
-    The same call resumes an interrupted recording; a finished one is left as it is.
+    They go into ``out``, a folder or a URL. The same call resumes an interrupted recording; a finished one is left as
+    it is.
 
     Raises:
         InputError: bad values, a configuration that does not run or lets nobody drive, or ``out`` holds another run.
@@ -72,7 +73,7 @@ def record_sumocfg(
     return record_dataset(
         out,
         recording.settings(),
-        _Shards(recording, out),
+        _Shards(recording, Path(out)),
         episodes_per_shard=EPISODES_PER_SHARD,
         episode_s=EPISODE_STEPS * STEP_S,
         workers=workers,

@@ -64,7 +64,7 @@ class Recording:
 
 
 def record(
-    out: Path,
+    out: str | Path,
     windows: int,
     *,
     p_conservative: Share = 0.5,
@@ -75,7 +75,7 @@ def record(
     fcd: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Record a dataset of at least ``windows`` windows into ``out`` and return its manifest.
+    """Record a dataset of at least ``windows`` windows into ``out``, a folder or a URL, and return its manifest.
 
     The same call resumes an interrupted recording; a finished one is left as it is. With ``fcd`` the trajectories are
     written as SUMO's floating-car data, too, also those of a dataset that is there already. The population is the
@@ -90,19 +90,14 @@ def record(
         return record_dataset(
             out,
             recording.settings(),
-            _Shards(recording, fcd, out),
+            _Shards(recording, fcd, Path(out)),
             episodes_per_shard=EPISODES_PER_SHARD,
             episode_s=EPISODE_STEPS * recording.played().step_s,
-            parts=_parts(fcd),
             workers=workers,
             progress=progress,
         )
     finally:
         _simulations.clear()  # ends the simulation: libsumo is free again
-
-
-def _parts(fcd: bool) -> tuple[str, ...]:
-    return (*TABLES, FCD) if fcd else TABLES
 
 
 @dataclass(frozen=True)
@@ -114,7 +109,7 @@ class _Shards:
     out: Path
 
     def paths(self, number: int) -> tuple[str, ...]:
-        return tuple(shard_path(part, number) for part in _parts(self.fcd))
+        return tuple(shard_path(part, number) for part in (*TABLES, *([FCD] if self.fcd else [])))
 
     def __call__(self, number: int) -> ShardContents:
         if not has_tables(self.out, number):

@@ -7,7 +7,7 @@ for, tells the trajectories once more, as SUMO does.
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import pandas as pd
@@ -69,7 +69,7 @@ def shard_file(folder: Path, part: str, shard: int) -> Path:
     return folder / shard_path(part, shard)
 
 
-def shard_number(file: Path) -> int:
+def shard_number(file: PurePath) -> int:
     """Of a path made by ``shard_file``."""
     return int(file.name.removeprefix("shard-").split(".")[0])
 

@@ -5,15 +5,18 @@ dataset does not depend on the number of workers, and an interrupted recording r
 than a shard per process is in memory at a time.
 """
 
+import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import count
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from tint_sumo.changes import write_files
 from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, WINDOW_STEPS
 from tint_sumo.dataset.schema import (
     DRIVER_SCHEMA,
@@ -32,6 +35,7 @@ from tint_sumo.executors import Executor, Work, Workers, executor_of
 from tint_sumo.files import claim_folder, read_json, whole_file, write_json
 from tint_sumo.progress import make_bar
 from tint_sumo.provenance import versions
+from tint_sumo.stores import Store, is_url, working_folder
 
 EPISODE_STEPS = 500
 _WINDOWS_KEY = b"tint_sumo.windows"
@@ -59,24 +63,23 @@ def require_sizes(windows: int, seed: int) -> None:
 
 
 def record_dataset(
-    out: Path,
+    out: str | Path,
     settings: Mapping[str, Any],
     shards: Work[ShardContents],
     *,
     episodes_per_shard: int,
     episode_s: float,
-    parts: Sequence[str] = TABLES,
     workers: Workers = 1,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Record shards into ``out`` until they hold enough windows, or go on with that; the dataset's manifest.
 
     Args:
-        out: a new folder, or the one of this very recording.
+        out: a new folder, or the one of this very recording, or its URL: shards then go there from where they are
+            recorded.
         settings: what the dataset follows from; ``windows`` tells how many windows are enough.
         shards: records a shard by its number, as far as it is not there already.
         episodes_per_shard, episode_s: what a shard consists of.
-        parts: what each shard has in ``out``.
         workers: processes that simulate, or an executor.
         progress: show a progress bar on stderr.
 
@@ -84,11 +87,17 @@ def record_dataset(
         InputError: ``out`` holds another run, or the number of workers makes no sense.
     """
     executor = executor_of(workers)
-    with claim_folder(out, settings, with_versions=False):  # the manifest has them
-        finished = _finished(out, parts)
+    store = Store(str(out) if is_url(out) else Path(out).resolve().as_uri())
+    with (
+        working_folder(out, without=(*TABLES, FCD)) as folder,
+        claim_folder(folder, settings, with_versions=False),  # the manifest has them
+    ):
+        finished = _finished(folder, store, shards)
         if finished is not None:
             return finished
-        found = _record(out, settings["windows"], shards, executor, progress)
+        work = _Stored(shards, store) if is_url(out) else shards
+        found = _record(settings["windows"], work, executor, progress)
+        _remove_shards_from(store, len(found))
         manifest = {
             **settings,
             **_contents(found),
@@ -96,42 +105,66 @@ def record_dataset(
             "episodes": len(found) * episodes_per_shard,
             "episode_s": episode_s,
         }
-        write_json(out / MANIFEST, manifest)
+        write_json(folder / MANIFEST, manifest)
         return manifest
 
 
-def _finished(out: Path, parts: Sequence[str]) -> dict[str, Any] | None:
+def _finished(folder: Path, store: Store, shards: Work[ShardContents]) -> dict[str, Any] | None:
     """The manifest of a complete dataset."""
-    if not (out / MANIFEST).exists():
+    if not (folder / MANIFEST).exists():
         return None
-    manifest = read_json(out / MANIFEST, "dataset manifest")
-    shards = range(int(manifest.get("shards", 0)))
-    return manifest if all(shard_file(out, part, shard).exists() for part in parts for shard in shards) else None
+    manifest = read_json(folder / MANIFEST, "dataset manifest")
+    held = store.files()
+    wanted = (path for shard in range(int(manifest.get("shards", 0))) for path in shards.paths(shard))
+    return manifest if all(path in held for path in wanted) else None
 
 
-def _record(
-    out: Path, windows: int, shards: Work[ShardContents], executor: Executor, progress: bool
-) -> list[ShardContents]:
+def _record(windows: int, shards: Work[ShardContents], executor: Executor, progress: bool) -> list[ShardContents]:
     found: list[ShardContents] = []
+    done = 0
     with (
         make_bar(total=windows, desc="record", unit=" windows", disable=not progress) as bar,
         executor.map(shards, count()) as recorded,
     ):
         for shard in recorded:
             found.append(shard)
-            bar.update(min(shard.windows, windows - bar.n))
-            if sum(one.windows for one in found) >= windows:
+            bar.update(min(shard.windows, windows - done))
+            done += shard.windows
+            if done >= windows:
                 break
-    _remove_shards_from(out, len(found))
     return found
 
 
-def _remove_shards_from(out: Path, first: int) -> None:
+@dataclass(frozen=True)
+class _Stored:
+    """Shards that are recorded in a temporary folder, and kept in a store."""
+
+    shards: Work[ShardContents]
+    store: Store
+    out: Path = Path()  # nothing is left here
+
+    def paths(self, _number: int, /) -> tuple[str, ...]:
+        return ()
+
+    def __call__(self, number: int) -> ShardContents:
+        with tempfile.TemporaryDirectory(prefix="tint_sumo-") as scratch:
+            folder = Path(scratch)
+            paths = self.shards.paths(number)
+            held = {path: self.store.read(path) for path in paths if self.store.exists(path)}
+            write_files(folder, held)
+            found = replace(self.shards, out=folder)(number)  # type: ignore[type-var]
+            for path in paths:
+                if path not in held:
+                    self.store.write(path, (folder / path).read_bytes())
+            return found
+
+
+def _remove_shards_from(store: Store, first: int) -> None:
     """Workers run ahead: drop what they recorded beyond the last shard needed."""
     for part in (*TABLES, FCD):
-        for file in (out / part).glob("shard-*"):
-            if shard_number(file) >= first:
-                file.unlink()
+        for path in store.files(part):
+            if shard_number(PurePosixPath(path)) >= first:
+                store.delete(path)
 
 
 def _contents(shards: Sequence[ShardContents]) -> dict[str, Any]:

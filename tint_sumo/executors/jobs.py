@@ -68,10 +68,10 @@ class Work(Protocol[T_co]):
     def out(self) -> Path:
         """The folder it works in, as in jobs."""
 
-    def paths(self, number: int) -> tuple[str, ...]:
+    def paths(self, number: int, /) -> tuple[str, ...]:
         """The files in ``out`` that a piece goes on from and writes, as paths relative to it."""
 
-    def __call__(self, number: int) -> T_co:
+    def __call__(self, number: int, /) -> T_co:
         """Do one piece, as far as its files are not there, and say what came out."""
 
 

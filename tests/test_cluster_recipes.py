@@ -2,16 +2,19 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-import psutil
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 CLUSTER = ROOT / "examples" / "cluster"
@@ -76,15 +79,14 @@ class Slurm:
         script = str(CLUSTER / "slurm.sh")
         return subprocess.Popen([script, *command], env=environment, stderr=subprocess.PIPE, text=True)
 
-    def processes(self) -> list[psutil.Process]:
-        """All processes of the job that run."""
+    def processes(self) -> list[int]:
+        """The processes of the job that still run."""
+        variable = f"SLURM_JOB_ID={self.job}".encode()
         found = []
-        for process in psutil.process_iter():
-            try:
-                if process.environ().get("SLURM_JOB_ID") == self.job and process.status() != psutil.STATUS_ZOMBIE:
-                    found.append(process)
-            except psutil.Error:
-                continue
+        for file in Path("/proc").glob("[0-9]*/environ"):
+            with suppress(OSError):  # it has ended meanwhile
+                if variable in file.read_bytes().split(b"\0"):
+                    found.append(int(file.parent.name))
         return found
 
 
@@ -93,7 +95,7 @@ def slurm(tmp_path: Path) -> Iterator[Slurm]:
     machine = Slurm(tmp_path)
     yield machine
     for process in machine.processes():
-        process.kill()
+        os.kill(process, signal.SIGKILL)
     shutil.rmtree(f"/tmp/ray-{machine.job}", ignore_errors=True)
 
 
@@ -134,3 +136,81 @@ def test_slurm_tells_how_to_use_it(slurm: Slurm) -> None:
     assert process.returncode == 2
     assert "sbatch" in errors
     assert not slurm.calls.exists()
+
+
+# Ray's cluster launcher
+
+
+def test_the_launcher_takes_its_recipe() -> None:
+    util = pytest.importorskip("ray.autoscaler._private.util")
+    config = util.prepare_config(yaml.safe_load((CLUSTER / "launcher.yaml").read_text()))
+    util.validate_config(config)
+    with pytest.raises(Exception, match="max_workers"):
+        util.validate_config(config | {"max_workers": "many"})
+    assert config["available_node_types"]["worker"]["max_workers"] == 8
+    for local in config["file_mounts"].values():
+        assert local.startswith("~") or (ROOT / local).exists()
+    head, *_ = [command for command in config["head_start_ray_commands"] if "--head" in command]
+    assert "--dashboard-host=127.0.0.1" in head
+    assert any("RAY_AUTH_MODE=token" in command for command in config["setup_commands"])
+    assert "SecurityGroup" not in str(config), "Ray's own lets in nothing but ssh"
+
+
+# Kubernetes
+
+
+@pytest.fixture
+def manifests() -> dict[str, dict[str, Any]]:
+    documents = yaml.safe_load_all((CLUSTER / "kuberay.yaml").read_text())
+    return {document["kind"]: document for document in documents}
+
+
+def test_the_manifest_asks_for_a_head_and_eight_workers(manifests: dict[str, dict[str, Any]]) -> None:
+    job = manifests["RayJob"]
+    assert job["apiVersion"] == "ray.io/v1"
+    cluster = job["spec"]["rayClusterSpec"]
+    head, (workers,) = cluster["headGroupSpec"], cluster["workerGroupSpecs"]
+    assert workers["replicas"] == workers["minReplicas"] == workers["maxReplicas"] == 8
+    for group in (head, workers):
+        (container,) = group["template"]["spec"]["containers"]
+        assert container["resources"]["limits"] == {"cpu": "2", "memory": "4Gi"}
+        assert all(isinstance(value, str) for value in group["rayStartParams"].values())
+    pod = head["template"]["spec"]
+    (volume,), (mount,) = pod["volumes"], pod["containers"][0]["volumeMounts"]
+    claim = manifests["PersistentVolumeClaim"]["metadata"]["name"]
+    assert volume["persistentVolumeClaim"]["claimName"] == claim
+    assert f"--out {mount['mountPath']}/" in job["spec"]["entrypoint"]
+
+
+def test_only_the_namespace_and_the_operator_reach_the_pods(manifests: dict[str, dict[str, Any]]) -> None:
+    cluster = manifests["RayJob"]["spec"]["rayClusterSpec"]
+    assert cluster["headGroupSpec"]["serviceType"] == "ClusterIP"
+    assert cluster["authOptions"] == {"mode": "token"}
+    assert "Ingress" not in manifests
+    policy = manifests["NetworkPolicy"]["spec"]
+    for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
+        assert policy["podSelector"]["matchLabels"].items() <= group["template"]["metadata"]["labels"].items()
+        assert group["template"]["spec"]["securityContext"]["runAsNonRoot"]
+    namespace, operator = policy["ingress"]
+    assert namespace == {"from": [{"podSelector": {}}]}
+    assert operator["ports"] == [{"port": 8265}]
+
+
+def test_all_recipes_have_the_same_versions(manifests: dict[str, dict[str, Any]]) -> None:
+    dockerfile = (CLUSTER / "Dockerfile").read_text()
+    launcher = (CLUSTER / "launcher.yaml").read_text()
+    rays = re.findall(r"ray\[[\w,]+\]==([\d.]+)", dockerfile + launcher)
+    assert {manifests["RayJob"]["spec"]["rayClusterSpec"]["rayVersion"], *rays} == {rays[0]}
+    torches = re.findall(r"torch==([\d.]+\d)", dockerfile + launcher + (ROOT / "Makefile").read_text())
+    assert len(set(torches)) == 1
+    libraries = re.findall(r"install (?:-y -qq|--yes --no-install-recommends) ([\w ]+)", dockerfile + launcher)
+    assert len(libraries) == 2
+    assert libraries[0].split() == libraries[1].split()
+
+
+def test_the_image_has_all_that_the_package_is_built_from() -> None:
+    copied = set(re.findall(r"^COPY (.+) \S+$", (CLUSTER / "Dockerfile").read_text(), re.MULTILINE))
+    mounted = yaml.safe_load((CLUSTER / "launcher.yaml").read_text())["file_mounts"].values()
+    parts = {part for group in copied for part in group.split()}
+    assert parts == {local for local in mounted if not local.startswith("~")}
+    assert {"pyproject.toml", "tint_sumo", "sumo_net", "data/models"} <= parts

@@ -90,6 +90,14 @@ class Slurm:
         return found
 
 
+    def is_over(self) -> bool:
+        """Whether no process of the job is left; those that have been told to end get a while."""
+        deadline = time.monotonic() + 20.0
+        while self.processes() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        return not self.processes()
+
+
 @pytest.fixture
 def slurm(tmp_path: Path) -> Iterator[Slurm]:
     machine = Slurm(tmp_path)
@@ -112,7 +120,7 @@ def test_slurm_runs_a_command_on_all_nodes_and_ends_ray(slurm: Slurm, tmp_path: 
     head, workers = slurm.calls.read_text().splitlines()  # and no scontrol
     assert "--nodes=1" in head and "--nodelist=node1" in head
     assert "--nodes=1" in workers and "--exclude=node1" in workers
-    assert not slurm.processes()
+    assert slurm.is_over()
 
 
 @pytest.mark.slow
@@ -127,7 +135,7 @@ def test_slurm_puts_a_command_back_into_the_queue_before_its_time_is_over(slurm:
     process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 128 + signal.SIGTERM
     assert slurm.calls.read_text().splitlines()[-1] == f"scontrol requeue {slurm.job}"
-    assert not slurm.processes()
+    assert slurm.is_over()
 
 
 def test_slurm_tells_how_to_use_it(slurm: Slurm) -> None:
@@ -136,6 +144,15 @@ def test_slurm_tells_how_to_use_it(slurm: Slurm) -> None:
     assert process.returncode == 2
     assert "sbatch" in errors
     assert not slurm.calls.exists()
+
+
+def test_slurm_tells_that_ray_did_not_start(slurm: Slurm, tmp_path: Path) -> None:
+    (tmp_path / "srun").write_text("#!/usr/bin/env bash\nexit 1\n")
+    process = slurm.start(1, "touch", str(tmp_path / "begun"))
+    _, errors = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 1
+    assert "Ray did not start on node1" in errors
+    assert not (tmp_path / "begun").exists()
 
 
 # Ray's cluster launcher

@@ -47,8 +47,8 @@ start_ray 1 --nodelist="$SLURMD_NODENAME" ray start --head --block --node-ip-add
     --ray-client-server-port=$((port + 1)) --dashboard-host=127.0.0.1 --dashboard-port=$((port + 2)) \
     --temp-dir="/tmp/ray-$SLURM_JOB_ID"
 head=$!
-until ray health-check --address "$address:$port" >/dev/null 2>&1; do
-    kill -0 "$head" || { echo "Ray did not start on $SLURMD_NODENAME" >&2; exit 1; }
+until (: <"/dev/tcp/$address/$port") 2>/dev/null && ray health-check --address "$address:$port" >/dev/null 2>&1; do
+    kill -0 "$head" 2>/dev/null || { echo "Ray did not start on $SLURMD_NODENAME" >&2; exit 1; }
     sleep 1
 done
 if [ "$SLURM_JOB_NUM_NODES" -gt 1 ]; then

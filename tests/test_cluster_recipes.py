@@ -89,7 +89,6 @@ class Slurm:
                     found.append(int(file.parent.name))
         return found
 
-
     def is_over(self) -> bool:
         """Whether no process of the job is left. A helper of Ray's dashboard ends some ten seconds after the others."""
         deadline = time.monotonic() + PATIENCE_S

@@ -69,6 +69,51 @@ class FileJob:
         return "written"
 
 
+@dataclass(frozen=True)
+class CountJob:
+    """Counts to ``end`` and keeps every number, and the first one of each run, from which it goes on."""
+
+    name: str
+    out: Path
+    end: int
+    pause_s: float = 0.1
+
+    needs = ()
+    inputs = ()
+    uses_gpu = False
+
+    @property
+    def title(self) -> Title:
+        return Title(self.name)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return self.name, f"{self.name}.done"
+
+    @property
+    def numbers(self) -> list[int]:
+        """Those that it has counted, one after the other."""
+        return sorted(int(file.name) for file in (self.out / self.name).glob("[0-9]*"))
+
+    @property
+    def begins(self) -> list[int]:
+        """With which numbers its runs began, as far as they have told."""
+        return sorted(int(file.name.removeprefix("from-")) for file in (self.out / self.name).glob("from-*"))
+
+    def is_done(self) -> bool:
+        return (self.out / f"{self.name}.done").exists()
+
+    def run(self, report: Report) -> str:
+        first = max(self.numbers, default=-1) + 1
+        write_text(self.out / self.name / f"from-{first}", "")
+        for number in range(first, self.end):
+            time.sleep(self.pause_s)
+            write_text(self.out / self.name / str(number), str(number))
+            report(Progress(number + 1, self.end, "number"))
+        write_text(self.out / f"{self.name}.done", "")
+        return "counted"
+
+
 if __name__ == "__main__":
     folder, is_short = Path(sys.argv[1]), "short" in sys.argv
     times = {"reports": 3} if is_short else {"patience_s": 60.0}

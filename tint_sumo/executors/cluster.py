@@ -7,6 +7,7 @@ is begun again with its last checkpoint. Pieces of work travel likewise, as a wh
 
 import logging
 import os
+import socket
 import tempfile
 import time
 from collections import Counter, deque
@@ -31,6 +32,7 @@ from tint_sumo.progress import Progress
 T = TypeVar("T")
 
 LOOK_INTERVAL_S = 2.0  # so often a job's outputs are looked at, and its news sent
+ANSWER_S = 5.0  # so long a cluster may take to answer
 PIECES_PER_CPU = 2  # pieces that are done or wait on a CPU: nobody is idle while results travel
 _HEAD = {"node:__internal_head__": 0.001}  # Ray's resource that only the head node has
 
@@ -44,9 +46,9 @@ def ray_cluster(address: str = "auto", gpus_per_job: float = 0.0) -> Iterator["R
     """In the block, an executor on the Ray cluster at an address.
 
     Args:
-        address: ``ray://host:port`` of a cluster, ``host:port`` of one that this machine is a node of, or ``"auto"``:
-            the cluster that this machine is a node of or, if there is none, Ray on this machine alone, which then
-            listens on 127.0.0.1 only.
+        address: ``ray://host:port`` of a cluster, ``host:port`` of one that this machine is a node of, ``"local"`` for
+            Ray on this machine alone, or ``"auto"``: the cluster that this machine is a node of or, if there is none,
+            ``"local"``.
         gpus_per_job: share of a GPU that each job has that a GPU makes faster, if the cluster has GPUs.
 
     Raises:
@@ -67,13 +69,24 @@ def _connect(address: str) -> str:
     """Connect this process; where the cluster's dashboard is."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody is told of what runs here
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
+    if address not in ("auto", "local"):
+        _require_answer(address)
     try:
         context = ray.init(address, **options)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except ConnectionError:
         if address != "auto":
-            raise InputError(f"no Ray cluster answers at {address} ({_first_line(error)}); check --address") from None
-        context = ray.init("local", _node_ip_address="127.0.0.1", **options)
+            raise
+        context = ray.init("local", **options)
     return context.dashboard_url or ""
+
+
+def _require_answer(address: str) -> None:
+    """Raise InputError unless somebody listens at an address; Ray itself tries for minutes."""
+    host, _, port = address.removeprefix("ray://").partition(":")
+    try:
+        socket.create_connection((host, int(port)), ANSWER_S).close()
+    except (OSError, ValueError) as error:
+        raise InputError(f"no Ray cluster answers at {address} ({error}); check --address") from None
 
 
 def _resources() -> dict[str, float]:

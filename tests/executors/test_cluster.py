@@ -1,0 +1,286 @@
+"""A real Ray cluster of several nodes on this machine, whose nodes come, work and die."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.dataset.test_recorder import TWO_SHARDS, contents
+from tests.executors.jobs import CountJob, FileJob
+from tests.executors.test_local import PATIENCE_S, wait_until
+from tint_sumo.config import PpoSettings
+from tint_sumo.dataset.recorder import record
+from tint_sumo.dataset.schema import MANIFEST
+from tint_sumo.errors import InputError, JobError
+from tint_sumo.executors import Executor, Local
+from tint_sumo.study.budgets import Budget, Conditions, Trials
+from tint_sumo.study.grid import plan
+from tint_sumo.study.policy_jobs import TrainJob
+
+pytest.importorskip("ray", reason="Ray is not installed: pip install 'tint_sumo[ray]'")
+
+from ray.cluster_utils import Cluster
+
+from tint_sumo.executors.cluster import ray_cluster
+
+NODES = 3
+MANY_WINDOWS = 60_000  # some seconds' work
+
+
+class Nodes:
+    """A head node that does no jobs, and nodes of one CPU each that do."""
+
+    def __init__(self) -> None:
+        # A dead node is noticed within a second or two, not within half a minute.
+        fast = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 2}
+        head = {"num_cpus": 0, "include_dashboard": False, "_system_config": fast, **self._small()}
+        self._cluster = Cluster(initialize_head=True, head_node_args=head)
+        self.workers: list[Any] = []
+        self.restore()
+
+    def _small(self) -> dict[str, Any]:
+        return {"object_store_memory": 100 * 2**20}
+
+    @property
+    def address(self) -> str:
+        return str(self._cluster.address)
+
+    def add(self) -> None:
+        self.workers.append(self._cluster.add_node(num_cpus=1, **self._small()))
+
+    def kill(self, index: int) -> None:
+        """With SIGKILL, as if the machine had gone."""
+        self._cluster.remove_node(self.workers.pop(index), allow_graceful=False)
+
+    def restore(self) -> None:
+        while len(self.workers) < NODES:
+            self.add()
+
+    def end(self) -> None:
+        self._cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def nodes() -> Iterator[Nodes]:
+    made = Nodes()
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def cluster(nodes: Nodes) -> Iterator[Executor]:
+    nodes.restore()
+    with ray_cluster(nodes.address) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def many_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset that takes three nodes several seconds."""
+    folder = tmp_path_factory.mktemp("many_shards")
+    record(folder, MANY_WINDOWS, workers=2, progress=False)
+    return folder
+
+
+@contextmanager
+def meanwhile(work: Callable[[], Any]) -> Iterator[None]:
+    """Do some work in a thread while the block runs, and wait for its end; nodes can begin in the main thread only."""
+    with ThreadPoolExecutor(1) as thread:
+        future = thread.submit(work)
+        yield
+        future.result()
+
+
+def test_jobs_read_what_others_wrote_on_other_nodes(cluster: Executor, tmp_path: Path) -> None:
+    jobs = [FileJob("last", tmp_path, needs=("base", "other")), FileJob("base", tmp_path), FileJob("other", tmp_path)]
+    cluster.run(jobs, progress=False)
+    assert [job.path("done").read_text() for job in jobs] == ["", "", ""]
+    assert len({job.path("pid").read_text() for job in jobs}) == 3
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+@pytest.mark.parametrize(("failure", "error", "tries"), [("refused", InputError, 1), ("died", JobError, 3)])
+def test_a_job_that_fails_is_named_and_the_others_finish(
+    cluster: Executor, tmp_path: Path, failure: str, error: type[Exception], tries: int
+) -> None:
+    bad, good = FileJob("bad", tmp_path, failure=failure), FileJob("good", tmp_path)
+    child = FileJob("child", tmp_path, needs=("bad",))
+    with pytest.raises(error, match=r"bad: .*; skipped, because they need these: child") as caught:
+        cluster.run([bad, good, child], progress=False)
+    assert ("this is not for me" if failure == "refused" else "exit code 7") in str(caught.value)
+    assert (bad.tries, good.is_done(), child.tries) == (tries, True, 0)
+    log = (tmp_path / "logs" / "bad.log").read_text()
+    assert log == ("this is not for me\n" if failure == "refused" else "")
+
+
+def test_a_recording_is_the_same_byte_for_byte(cluster: Executor, two_shards: Path, tmp_path: Path) -> None:
+    record(tmp_path, TWO_SHARDS, workers=cluster, progress=False)
+    assert not (tmp_path / "fcd").exists()
+    record(tmp_path, TWO_SHARDS, workers=cluster, fcd=True, progress=False)
+    assert contents(tmp_path) == contents(two_shards)
+    assert (tmp_path / MANIFEST).read_bytes() == (two_shards / MANIFEST).read_bytes()
+
+
+def test_a_recording_survives_a_node(nodes: Nodes, cluster: Executor, many_shards: Path, tmp_path: Path) -> None:
+    with meanwhile(lambda: record(tmp_path, MANY_WINDOWS, workers=cluster, progress=False)):
+        wait_until((tmp_path / "drivers" / "shard-00003.parquet").exists)
+        nodes.kill(0)
+    assert len(nodes.workers) == NODES - 1
+    assert contents(tmp_path) == contents(many_shards)
+
+
+def test_a_job_goes_on_from_what_it_had_left_when_its_node_dies(
+    nodes: Nodes, cluster: Executor, tmp_path: Path
+) -> None:
+    jobs = [CountJob(f"count{number}", tmp_path, 60) for number in range(NODES)]
+
+    with meanwhile(lambda: cluster.run(jobs, progress=False)):
+        wait_until(lambda: all(job.numbers for job in jobs))
+        nodes.kill(0)
+    assert [job.numbers for job in jobs] == [list(range(60))] * NODES
+    begins = sorted(job.begins for job in jobs)
+    assert begins[:-1] == [[0]] * (NODES - 1)
+    first, second = begins[-1]
+    assert first == 0 < second
+
+
+def test_a_node_that_joins_is_used(nodes: Nodes, cluster: Executor, tmp_path: Path) -> None:
+    jobs = [CountJob(f"count{number}", tmp_path, 80) for number in range(NODES + 1)]
+
+    with meanwhile(lambda: cluster.run(jobs, progress=False)):
+        wait_until(lambda: sum(bool(job.numbers) for job in jobs) == NODES)
+        nodes.add()
+        wait_until(lambda: all(job.numbers for job in jobs))
+        assert not any(job.is_done() for job in jobs)
+    nodes.kill(0)
+
+
+@pytest.mark.slow
+def test_a_study_is_the_same_file_for_file(cluster: Executor, brief: PpoSettings, tmp_path: Path) -> None:
+    budget = Budget(
+        traits=None,
+        ppo=brief,
+        methods=("always_go", "oracle", "cross_window"),
+        mixes=(0.4,),
+        seeds=(0,),
+        trials=(Trials((Conditions(0.4), Conditions(0.4, percent=50)), 3),),
+    )
+    here, there = tmp_path / "here", tmp_path / "there"
+    Local(2).run(plan(budget, here), progress=False)
+    cluster.run(plan(budget, there), progress=False)
+    made = files(here)
+    assert {"ceilings.json", "results/always_go.json", "policies/oracle-P0.4-seed0/policy.safetensors"} <= made.keys()
+    assert files(there) == made
+
+
+def files(out: Path) -> dict[str, bytes]:
+    """What a study has made, without its logs and what TensorBoard shows, which tell the time."""
+    made = {str(file.relative_to(out)): file for file in out.rglob("*") if file.is_file()}
+    timed = ("logs/", "tensorboard", ".lock")
+    return {path: file.read_bytes() for path, file in made.items() if not any(part in path for part in timed)}
+
+
+@pytest.mark.slow
+def test_a_training_survives_a_node_with_its_checkpoint(
+    nodes: Nodes, cluster: Executor, brief: PpoSettings, tmp_path: Path
+) -> None:
+    """It takes longer than the 15 s between two checkpoints."""
+    steps = 64 * 700
+    job = TrainJob("no_labels", 0.4, 0, replace(brief, total_steps=steps), True, tmp_path)
+
+    with meanwhile(lambda: cluster.run([job], progress=False)):
+        wait_until((job.folder / "checkpoint.zip").exists)
+        for _ in range(NODES):  # one of them does the job
+            nodes.kill(0)
+        nodes.add()
+    decisions = [int(line.split(",")[0]) for line in (job.folder / "curve.csv").read_text().splitlines()[1:]]
+    assert decisions == sorted(set(decisions))
+    assert decisions[-1] == steps
+    assert job.is_done()
+    assert not (job.folder / "checkpoint.zip").exists()
+
+
+DRIVER = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tests.executors.jobs import CountJob
+from tint_sumo.executors.cluster import ray_cluster
+
+if __name__ == "__main__":
+    address, out = sys.argv[1], Path(sys.argv[2])
+    try:
+        with ray_cluster(address) as cluster:
+            cluster.run([CountJob(name, out, 50) for name in ("first", "second")])
+    except KeyboardInterrupt:
+        sys.exit(130)
+"""
+
+
+def driver(nodes: Nodes, out: Path) -> "subprocess.Popen[bytes]":
+    script = out / "driver.py"
+    script.write_text(DRIVER)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")])}
+    return subprocess.Popen([sys.executable, str(script), nodes.address, str(out)], env=environment)
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
+def test_a_driver_that_ends_goes_on_with_the_same_call(nodes: Nodes, tmp_path: Path, sent: signal.Signals) -> None:
+    nodes.restore()
+    jobs = [CountJob(name, tmp_path, 50) for name in ("first", "second")]
+    process = driver(nodes, tmp_path)
+    wait_until(lambda: all(job.numbers for job in jobs))
+    process.send_signal(sent)
+    assert process.wait(PATIENCE_S) == (130 if sent == signal.SIGINT else -sent)
+    left = [len(job.numbers) for job in jobs]
+    assert all(0 < count < 50 for count in left)
+    assert driver(nodes, tmp_path).wait(PATIENCE_S) == 0
+    assert [job.numbers for job in jobs] == [list(range(50))] * 2
+    assert [job.begins for job in jobs] == [[0, count] for count in left]
+
+
+@pytest.mark.long
+def test_twenty_kills_lose_nothing(nodes: Nodes, cluster: Executor, many_shards: Path, tmp_path: Path) -> None:
+    """Nodes die at random moments, some of them before they have begun to work, and others join."""
+    moments = random.Random(0)
+    recorded = tmp_path / "dataset"
+    jobs = [CountJob(f"count{number}", tmp_path, 80) for number in range(3 * NODES)]
+
+    def work() -> None:
+        record(recorded, MANY_WINDOWS, workers=cluster, progress=False)
+        cluster.run(jobs, progress=False)
+
+    kills_in = {"the recording": 0, "the jobs": 0}
+    with meanwhile(work):
+        while not all(job.is_done() for job in jobs):
+            time.sleep(moments.uniform(0.0, 1.5))
+            kills_in["the jobs" if (recorded / MANIFEST).exists() else "the recording"] += 1
+            nodes.kill(moments.randrange(NODES))
+            nodes.add()
+    assert contents(recorded) == contents(many_shards)
+    assert [job.numbers for job in jobs] == [list(range(80))] * (3 * NODES)
+    assert min(kills_in.values()) >= 3
+    assert sum(kills_in.values()) >= 20
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "ray://127.0.0.1", "nowhere"])
+def test_no_cluster_at_an_address(address: str) -> None:
+    with pytest.raises(InputError, match=f"^no Ray cluster answers at {address} .*; check --address$"):
+        ray_cluster(address).__enter__()
+
+
+def test_a_share_of_a_gpu() -> None:
+    with pytest.raises(InputError, match="gpus_per_job must be 0 or more, not -1"):
+        ray_cluster("auto", -1.0).__enter__()

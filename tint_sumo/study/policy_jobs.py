@@ -23,7 +23,7 @@ from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Measured, Result
 from tint_sumo.study.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
 from tint_sumo.study.trait_job import trait_folder
 
-CASES = 0  # the set of cases that all policies are tested on
+CASES = 0  # the set of cases that all policies of a study are tested on
 _SMOOTHED = 5  # points of a learning curve
 
 
@@ -107,6 +107,7 @@ class EvaluateJob:
     trials: tuple[Trials, ...]
     out: Path  # folder of the study
     scene: AnyScene = T_INTERSECTION
+    cases: int = CASES  # which set of cases
 
     uses_gpu = False
 
@@ -172,7 +173,7 @@ class EvaluateJob:
             contender.policy,
             lambda num_envs: contender.make_venv(num_envs, **conditions.world),
             episodes,
-            CASES,
+            self.cases,
             report=report,
         )
 

@@ -545,8 +545,8 @@ class SweepPolicy(SpreadCommand):
     after_interrupt: ClassVar[str] = RESUMES
 
     set: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE,VALUE [NAME=VALUE,VALUE ...]")]
-    """Values of PPO's settings, such as learning_rate=0.001,0.003 n_epochs=2,4; those of the network begin with policy,
-    such as policy.hidden_size=32,64."""
+    """Values of PPO's settings, all behind one --set, such as learning_rate=0.001,0.003 n_epochs=2,4; names of the
+    network's settings begin with policy, such as policy.hidden_size=32,64."""
     out: FolderOrUrl
     """Folder of the sweep, or a URL such as s3://bucket/folder."""
     methods: tuple[str, ...] = ("oracle",)

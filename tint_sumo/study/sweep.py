@@ -29,7 +29,7 @@ from tint_sumo.scenes import T_INTERSECTION, Scene, described, digest_of
 from tint_sumo.standings import Title
 from tint_sumo.structures import overlay, require_fields
 from tint_sumo.study.budgets import ALL_MIXES, Conditions, Trials
-from tint_sumo.study.evaluation import require_cases, require_seed
+from tint_sumo.study.evaluation import TUNING_CASES, require_cases, require_seed
 from tint_sumo.study.grid import require_scene
 from tint_sumo.study.methods import METHODS, Learned, find_learned
 from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
@@ -37,7 +37,6 @@ from tint_sumo.study.results import Result
 from tint_sumo.study.tables import Lines, Table
 from tint_sumo.yaml_files import read_list
 
-TUNING_CASES = 1000  # the set of cases that settings are chosen on, which is reported nowhere
 MAX_NAME = 150  # characters of a variant's name: it is part of the names of files
 _NETWORK = "policy."
 _ATTENTION = "policy.attention"
@@ -161,7 +160,7 @@ def plan(sweep: Sweep, out: Path) -> "list[VariantJob]":
 
 @dataclass(frozen=True)
 class VariantJob:
-    """A job of a study, done in the folder of a variant, which is that of a study."""
+    """A job of a study, done in a variant's folder, which is laid out as a study's."""
 
     variant: str
     job: TrainJob | EvaluateJob  # wherever its own folder is
@@ -254,9 +253,8 @@ def report_markdown(table: pd.DataFrame, episodes: int) -> str:
     """Success by variant and method, means and standard deviations over the seeds; the best line comes first."""
     note = (
         f"Success in percent of {episodes} cases at each P(conservative), ± the standard deviation between training "
-        "seeds. Mean: over all P. The cases "
-        f"are those of set {TUNING_CASES}, which are reported nowhere: the best of many lines is also a lucky one, so "
-        "test the values that you choose on other cases."
+        f"seeds; mean: over all P. The cases are of set {TUNING_CASES}, which settings are chosen on and which is "
+        "reported nowhere. The best of many lines is also a lucky one, so test what you choose on other cases."
     )
     return "\n\n".join(Table("Success by settings of PPO", _lines(table), note).markdown) + "\n"
 

@@ -538,6 +538,55 @@ class EvaluatePolicy(SpreadCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
+class SweepPolicy(SpreadCommand):
+    """Train and test methods with other settings of PPO, all combinations; the same command resumes it. Tests are on
+    cases that are reported nowhere (set 1000), so that settings can be chosen by them."""
+
+    after_interrupt: ClassVar[str] = RESUMES
+
+    set: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE,VALUE [NAME=VALUE,VALUE ...]")]
+    """Values of PPO's settings, all behind one --set, such as learning_rate=0.001,0.003 n_epochs=2,4; names of the
+    network's settings begin with policy, such as policy.hidden_size=32,64."""
+    out: FolderOrUrl
+    """Folder of the sweep, or a URL such as s3://bucket/folder."""
+    methods: tuple[str, ...] = ("oracle",)
+    """Learned methods: no_labels, morton, vae, no_attention, cross_window, streaming, streaming_critic, ma, oracle."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of the trainings, 0 to 1000."""
+    p_conservative: ShareFlag = (0.1, 0.9)
+    """Probability in training that a driver is conservative, 0 to 1; two numbers: each episode draws its own between
+    them. Tests are at those of 0.25, 0.4 and 0.6 that this includes."""
+    budget: PpoBudgetValue = "full"
+    """Sizes of the network, settings of PPO and number of decisions, where --set does not say others."""
+    scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
+    episodes: int = 500
+    """Number of cases of each test."""
+    workers: int = 2
+    """Processes of this machine at a time."""
+    gpus_per_job: float = 0.0
+    """Share of a GPU for each training, with --executor ray and where the cluster has GPUs."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.sweep import Sweep, read_varied, report_markdown, run_sweep
+
+        sweep = Sweep(
+            _PPO_BUDGET.full(self.budget),
+            read_varied(self.set),
+            methods=self.methods,
+            seeds=self.seeds,
+            p_conservative=_share(self.p_conservative),
+            scene=self.scene,
+            episodes=self.episodes,
+        )
+        with working_folder(self.out) as out, self.workers_of(self.workers, self.gpus_per_job) as workers:
+            table = run_sweep(sweep, out, workers=workers)
+        files = [str(out / "sweep.csv"), str(out / "sweep.md")]
+        text = "\n".join([report_markdown(table, self.episodes), *(f"wrote {file}" for file in files)])
+        rows = table.astype(object).where(table.notna(), None).to_dict("records")
+        return Outcome(text, {"results": rows, "files": files}).naming(self.out, out)
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunStudy(SpreadCommand):
     """Record, learn traits, train and evaluate every method, report; the same command resumes an interrupted study."""
 
@@ -694,7 +743,11 @@ class Traits:
 class Policy:
     """Navigation policies."""
 
-    command: Annotated[TrainPolicy, subcommand("train")] | Annotated[EvaluatePolicy, subcommand("evaluate")]
+    command: (
+        Annotated[TrainPolicy, subcommand("train")]
+        | Annotated[EvaluatePolicy, subcommand("evaluate")]
+        | Annotated[SweepPolicy, subcommand("sweep")]
+    )
 
 
 @dataclass(frozen=True)

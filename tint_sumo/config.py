@@ -50,6 +50,14 @@ def require_fraction(owner: object, *names: str) -> None:
             raise InputError(f"{name} must lie in 0 to 1, not {getattr(owner, name)}")
 
 
+def require_distinct(owner: object, *names: str) -> None:
+    """Raise InputError unless these fields have one or more values, each of them once."""
+    for name in names:
+        values = getattr(owner, name)
+        if len(set(values)) < max(1, len(values)):
+            raise InputError(f"{name} must be one or more, each of them once, not {list(values)}")
+
+
 @dataclass(frozen=True)
 class VehicleShape:
     length_m: float = 5.0  # code
@@ -354,3 +362,8 @@ class PpoSettings:
         require_at_least(self, 0, "ent_coef", "final_ent_coef", "vf_coef")
         require_positive(self, "learning_rate", "clip_range", "max_grad_norm", "time_limit_s")
         require_fraction(self, "gamma", "gae_lambda")
+        if self.n_minibatches > self.n_envs:
+            raise InputError(
+                f"n_minibatches must be at most n_envs ({self.n_envs}), whose sequences stay whole, "
+                f"not {self.n_minibatches}"
+            )

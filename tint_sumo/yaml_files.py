@@ -76,6 +76,19 @@ def read_yaml(file: Path) -> YamlFile:
     return YamlFile(file, content, lines)
 
 
+def read_list(text: str) -> list[Any]:
+    """The values of a list without its brackets, such as ``1e-3, [64, 64], true``.
+
+    Raises:
+        InputError: it is not YAML.
+    """
+    try:
+        values: list[Any] = yaml.load(f"[{text}]", Loader=_Loader)
+    except (yaml.YAMLError, RecursionError):
+        raise InputError(f"{text!r} must be values with commas between them, such as 0.001,0.003") from None
+    return values
+
+
 def _lines(node: yaml.Node, where: Where) -> Iterator[tuple[Where, int]]:
     """The way to each value below a node, and the line it begins in."""
     if isinstance(node, yaml.MappingNode):

@@ -8,7 +8,7 @@ from tint_sumo.study import budgets
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.ceiling import ceiling
 from tint_sumo.study.ceiling_job import CEILINGS_FILE, CeilingJob, read_ceilings
-from tint_sumo.study.policy_jobs import CASES
+from tint_sumo.study.evaluation import CASES
 
 
 def test_there_is_a_ceiling_for_each_mix_of_the_training_s_world(tmp_path: Path) -> None:

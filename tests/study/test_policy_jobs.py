@@ -12,10 +12,10 @@ from tint_sumo.files import write_text
 from tint_sumo.progress import Progress, silent
 from tint_sumo.study import budgets, policy_jobs
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
-from tint_sumo.study.evaluation import evaluate
+from tint_sumo.study.evaluation import CASES, evaluate
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import METHODS
-from tint_sumo.study.policy_jobs import CASES, TrainJob, label, read_curves
+from tint_sumo.study.policy_jobs import TrainJob, label, read_curves
 from tint_sumo.study.results import GIVEN, TRAINED, Result
 from tint_sumo.study.training import CURVE_FILE
 

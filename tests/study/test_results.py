@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ from tests.study.scenes import given, trained, write_results
 from tint_sumo.config import Idm
 from tint_sumo.errors import InputError
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
+from tint_sumo.study.evaluation import TUNING_CASES
 from tint_sumo.study.report import write_report
 from tint_sumo.study.results import RESULTS, Result, read_results
 
@@ -45,6 +47,22 @@ def test_a_file_says_how_the_policy_fared_without_a_look_at_the_cases(study: Pat
 def test_a_policy_that_no_test_is_for_has_no_cases(tmp_path: Path) -> None:
     untested = trained("oracle", 0, {}, mix=0.25)
     assert read_results(write_results([untested], tmp_path)) == [untested]
+
+
+def test_results_of_a_sweep_are_no_study_s(tmp_path: Path) -> None:
+    tuned = replace(SOME_RESULTS[0], case_set=TUNING_CASES)
+    write_results([tuned], tmp_path)
+    assert Result.read(tmp_path / RESULTS / "0.json") == tuned
+    with pytest.raises(InputError, match="is part of a sweep, whose cases no study reports"):
+        read_results(tmp_path)
+
+
+def test_a_result_that_names_no_set_of_cases_is_of_the_reported_ones(study: Path) -> None:
+    file = study / RESULTS / "0.json"
+    content = json.loads(file.read_text())
+    assert content.pop("case_set") == 0
+    file.write_text(json.dumps(content))
+    assert read_results(study) == SOME_RESULTS
 
 
 def test_no_results(tmp_path: Path) -> None:

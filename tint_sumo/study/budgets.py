@@ -11,6 +11,7 @@ from tint_sumo.config import (
     Share,
     TraitSettings,
     require_at_least,
+    require_distinct,
     require_positive,
     require_share,
 )
@@ -85,10 +86,7 @@ class Budget:
     with_shipped: bool = False  # test the shipped policies, too
 
     def __post_init__(self) -> None:
-        for name in ("methods", "mixes", "seeds"):
-            values = getattr(self, name)
-            if len(set(values)) < max(1, len(values)):
-                raise InputError(f"{name} must be one or more, each of them once, not {list(values)}")
+        require_distinct(self, "methods", "mixes", "seeds")
         for mix in (self.record_p_conservative, *self.mixes):
             require_share(mix)
         require_at_least(self, 0, "seeds")

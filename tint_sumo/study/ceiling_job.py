@@ -10,7 +10,7 @@ from tint_sumo.scenes import T_INTERSECTION, Scene
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Trials
 from tint_sumo.study.ceiling import ceiling
-from tint_sumo.study.policy_jobs import CASES
+from tint_sumo.study.evaluation import CASES
 
 CEILINGS_FILE = "ceilings.json"
 

@@ -18,6 +18,8 @@ from tint_sumo.study.statistics import Rate
 CASE_SEED = 1_000_000_000
 CASES_PER_SEED = 1_000_000
 MAX_SEED = 1000
+CASES = 0  # the set of cases that studies report
+TUNING_CASES = 1000  # the set that settings are chosen on, which is reported nowhere
 BATCH = 100  # environments at a time
 _STOP = 0  # action of environments whose case is over
 

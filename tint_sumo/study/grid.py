@@ -53,7 +53,7 @@ def run_study(
         JobError: jobs were given up; all others are done.
     """
     executor = executor_of(workers)
-    _require_scene(budget, scene)
+    _require_traits(budget, require_scene("a study", scene))
     jobs = plan(budget, out, scene)
     place = {} if scene == T_INTERSECTION else described(scene)
     with claim_folder(out, {"kind": "study", **asdict(budget), **place}):
@@ -71,16 +71,25 @@ def run_study(
         return write_page(write_report(out), out, workers=executor, progress=progress)
 
 
-def _require_scene(budget: Budget, scene: str | Scene) -> None:
-    """Raise InputError unless a study can be made there."""
+def require_scene(work: str, scene: str | Scene) -> Scene:
+    """The scene, if this work, such as ``"a study"``, can be done there.
+
+    Raises:
+        InputError: it cannot.
+    """
     found = find_scene(scene)
     if not isinstance(found, Scene):
-        raise InputError(f"a study needs a built-in scene, or one with other numbers, not {found.name}")
+        raise InputError(f"{work} needs a built-in scene, or one with other numbers, not {found.name}")
     count = len(found.population.profiles)
     if count != 2:
-        raise InputError(f"a study is of two profiles of drivers, and scene {found.name} has {count}")
-    if budget.traits is None and found.digest != digest_of(T_INTERSECTION):
+        raise InputError(f"{work} is of two profiles of drivers, and scene {found.name} has {count}")
+    return found
+
+
+def _require_traits(budget: Budget, scene: Scene) -> None:
+    """Raise InputError unless the study has trait models for the scene."""
+    if budget.traits is None and scene.digest != digest_of(T_INTERSECTION):
         raise InputError(
-            f"the shipped trait models know the scene {T_INTERSECTION}, not {found.name}; give the budget traits, and "
+            f"the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; give the budget traits, and "
             "windows to learn them from, as the budget quick has"
         )

@@ -16,14 +16,13 @@ from tint_sumo.progress import Report, part_of
 from tint_sumo.scenes import T_INTERSECTION, AnyScene
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Conditions, Trials
-from tint_sumo.study.evaluation import Evaluation, evaluate
+from tint_sumo.study.evaluation import CASES, Evaluation, evaluate
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import METHODS, Rule, find_learned, find_method
 from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Measured, Result
 from tint_sumo.study.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
 from tint_sumo.study.trait_job import trait_folder
 
-CASES = 0  # the set of cases that all policies are tested on
 _SMOOTHED = 5  # points of a learning curve
 
 
@@ -107,6 +106,7 @@ class EvaluateJob:
     trials: tuple[Trials, ...]
     out: Path  # folder of the study
     scene: AnyScene = T_INTERSECTION
+    cases: int = CASES  # which set of cases
 
     uses_gpu = False
 
@@ -153,7 +153,8 @@ class EvaluateJob:
             tested.append(Measured(conditions, evaluation))
             done += episodes
         origin = GIVEN if self.mix is None else TRAINED
-        write_json(self.result_file, Result(self.method, origin, self.mix, self.seed, tuple(tested)).to_json())
+        result = Result(self.method, origin, self.mix, self.seed, tuple(tested), self.cases)
+        write_json(self.result_file, result.to_json())
         successes = ", ".join(f"{one.evaluation.rate('success').value:.1%}" for one in tested)
         return f"success {successes}"
 
@@ -172,7 +173,7 @@ class EvaluateJob:
             contender.policy,
             lambda num_envs: contender.make_venv(num_envs, **conditions.world),
             episodes,
-            CASES,
+            self.cases,
             report=report,
         )
 

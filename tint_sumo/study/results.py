@@ -9,7 +9,7 @@ from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.evaluation import Case, Evaluation
+from tint_sumo.study.evaluation import CASES, Case, Evaluation
 
 RESULTS = "results"  # folder of the results in a study's folder
 TRAINED, GIVEN = "trained", "given"  # origin of a policy: the study itself, or a rule or the package
@@ -32,6 +32,7 @@ class Result:
     mix: Share | None  # P(conservative) in training; None where the study did not train
     seed: int
     tested: tuple[Measured, ...]
+    case_set: int = CASES
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -39,6 +40,7 @@ class Result:
             "origin": self.origin,
             "mix": self.mix,
             "seed": self.seed,
+            "case_set": self.case_set,
             "tested": [
                 {
                     **asdict(one.conditions),
@@ -55,7 +57,8 @@ class Result:
         content = read_json(file, "result of a study")
         try:
             tested = tuple(Measured(_conditions(one), _evaluation(one)) for one in content["tested"])
-            result = cls(content["method"], content["origin"], _share(content["mix"]), int(content["seed"]), tested)
+            mix, seed, case_set = _share(content["mix"]), int(content["seed"]), int(content.get("case_set", CASES))
+            result = cls(content["method"], content["origin"], mix, seed, tested, case_set)
         except (LookupError, TypeError, ValueError) as error:
             raise InputError(f"{file} is damaged ({error!r}); remove it and run the study again") from None
         all_cases = [one.evaluation.cases for one in tested]
@@ -83,9 +86,12 @@ def read_results(out: Path) -> list[Result]:
     """Results of all finished jobs of the study in ``out``.
 
     Raises:
-        InputError: there are none, or a file is damaged.
+        InputError: there are none, a file is damaged, or they are of other cases than those that studies report.
     """
     files = sorted((out / RESULTS).glob("*.json"))
     if not files:
         raise InputError(f"no results in {out}; run the study first: tint-sumo study run --out {out}")
-    return [Result.read(file) for file in files]
+    results = [Result.read(file) for file in files]
+    if any(one.case_set != CASES for one in results):
+        raise InputError(f"{out} is part of a sweep, whose cases no study reports; read sweep.md in the folder above")
+    return results

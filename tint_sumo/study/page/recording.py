@@ -23,9 +23,10 @@ from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.driving import Moment, drive_case
+from tint_sumo.study.evaluation import CASES
 from tint_sumo.study.loading import Contender, find_policy, load_policy
 from tint_sumo.study.methods import METHODS, Rule
-from tint_sumo.study.policy_jobs import CASES, label, policy_folder, policy_path
+from tint_sumo.study.policy_jobs import label, policy_folder, policy_path
 from tint_sumo.study.trait_reader import TraitReader, fit_reader
 
 EPISODES = "episodes"  # folder of the recorded episodes in a study's folder

@@ -146,7 +146,7 @@ def test_rules_have_no_value_no_attention_and_nothing_inferred() -> None:
 
 def test_recordings_tell_the_case_and_are_made_once_for_a_policy_and_its_cases(tmp_path: Path) -> None:
     recording = Recording("always_go", None, 0, Conditions(0.4), (2, 0), tmp_path)
-    job = RecordJob(0, (recording,))
+    job = RecordJob(0, (recording,), tmp_path)
     assert not job.is_done()
     assert job.run(silent) == "policies: 1"
     episodes = read_episodes(recording.file)

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -15,6 +16,8 @@ from typing import Any
 
 import pytest
 import yaml
+
+from tint_sumo.cli import SpreadCommand, parse
 
 ROOT = Path(__file__).parents[1]
 CLUSTER = ROOT / "examples" / "cluster"
@@ -229,3 +232,13 @@ def test_the_image_has_all_that_the_package_is_built_from() -> None:
     parts = {part for group in copied for part in group.split()}
     assert parts == {local for local in mounted if not local.startswith("~")}
     assert {"pyproject.toml", "tint_sumo", "sumo_net", "data/models"} <= parts
+
+
+def test_the_commands_in_the_recipes_are_understood() -> None:
+    texts = [file.read_text(encoding="utf-8") for file in CLUSTER.iterdir() if file.is_file()]
+    found = {line for text in texts for line in re.findall(r"tint-sumo (study run [^'\"\n]*)", text)}
+    assert found
+    for line in found:
+        command = parse(shlex.split(line.split(">&2")[0]))
+        assert isinstance(command, SpreadCommand)
+        assert command.executor == "ray"

@@ -38,6 +38,7 @@ COMMAND_LINES = (
     "policy sweep --set learning_rate=1e-3,3e-3 n_epochs=2,4 --out s3://bucket/sweep --methods oracle ma --seeds 0 1",
     "study run --budget full --scene on_ramp --workers 3",
     "study report --out runs/full",
+    "study log train-oracle --out runs/full",
     "study scenes",
     "render --model oracle --out film.gif --case 3",
     "bench --quick",

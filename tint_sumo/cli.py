@@ -88,8 +88,8 @@ class SpreadCommand(Command):
     executor: Literal["local", "ray"] = "local"
     """local: this machine; ray: a Ray cluster, with the same results (needs tint_sumo[ray])."""
     address: str = "auto"
-    """Address of the Ray cluster, ray://HOST:10001; auto: the cluster that this machine is a node of or, if there is
-    none, Ray on this machine alone."""
+    """Address of the Ray cluster, ray://HOST:10001; local: Ray on this machine alone; auto: the cluster that
+    RAY_ADDRESS names or that runs on this machine or, if there is none, local."""
 
     @contextmanager
     def workers_of(self, workers: int, gpus_per_job: float = 0.0) -> "Iterator[Workers]":
@@ -643,6 +643,22 @@ class ReportStudy(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ShowLog(Command):
+    """Print what a job has written to its log, wherever it ran; a job that failed has its error there."""
+
+    name: Positional[str]
+    """Name of the job, as "train oracle-P0.4-seed0"."""
+    out: Path = Path("runs/quick")
+    """Folder of the study, the comparison or the sweep."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.executors.process import read_log
+
+        text = read_log(self.out, self.name)
+        return Outcome(text.rstrip("\n"), {"name": self.name, "log": text})
+
+
+@dataclass(frozen=True, kw_only=True)
 class StudyScenes(Command):
     """Test trait models in scenes they were not trained in, half an hour's work; the same command resumes it."""
 
@@ -757,6 +773,7 @@ class Study:
     command: (
         Annotated[RunStudy, subcommand("run")]
         | Annotated[ReportStudy, subcommand("report")]
+        | Annotated[ShowLog, subcommand("log")]
         | Annotated[StudyScenes, subcommand("scenes")]
     )
 

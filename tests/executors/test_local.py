@@ -12,6 +12,7 @@ import pytest
 from tests.executors.jobs import FileJob
 from tint_sumo.errors import InputError, JobError
 from tint_sumo.executors import Local
+from tint_sumo.executors.process import read_log
 
 PATIENCE_S = 60.0
 STATES = ("begins", "written")
@@ -96,7 +97,11 @@ def test_a_job_that_fails_once_is_tried_again(tmp_path: Path) -> None:
 def test_what_a_job_prints_is_in_its_log(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         Local(1).run([FileJob("bad", tmp_path, failure="refused")], progress=False)
-    assert (tmp_path / "logs" / "bad.log").read_text() == "this is not for me\n"
+    assert read_log(tmp_path, "bad") == "this is not for me\n"
+    with pytest.raises(InputError, match=f"^no log of a job good in {tmp_path}; known are bad$"):
+        read_log(tmp_path, "good")
+    with pytest.raises(InputError, match="no job has run there"):
+        read_log(tmp_path / "other", "good")
 
 
 def test_an_interruption_reaches_the_jobs(pool: "subprocess.Popen[bytes]", tmp_path: Path) -> None:

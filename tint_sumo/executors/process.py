@@ -6,9 +6,11 @@ import sys
 import time
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from pathlib import Path
 from types import FrameType
 from typing import NoReturn, TextIO
 
+from tint_sumo.errors import InputError
 from tint_sumo.executors.jobs import Ended, Job
 from tint_sumo.processes import start_worker, told
 from tint_sumo.progress import Progress
@@ -21,6 +23,20 @@ LOGS = "logs"  # folder of the jobs' logs in the folder they work in
 def log_path(name: str) -> str:
     """Where a job's log is in the folder it works in, as a path relative to it."""
     return f"{LOGS}/{name.replace(' ', '-').replace('/', '-')}.log"
+
+
+def read_log(out: Path, name: str) -> str:
+    """What a job that worked in the folder ``out`` has printed, its error included if it failed.
+
+    Raises:
+        InputError: it has no log there.
+    """
+    try:
+        return (out / log_path(name)).read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        names = sorted(file.stem for file in (out / LOGS).glob("*.log"))
+        known = f"known are {', '.join(names)}" if names else "no job has run there"
+        raise InputError(f"no log of a job {name} in {out}; {known}") from None
 
 
 class JobProcess:

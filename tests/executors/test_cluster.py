@@ -24,13 +24,14 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.schema import MANIFEST
 from tint_sumo.errors import InputError, JobError
 from tint_sumo.executors import Executor, Local
+from tint_sumo.executors.process import log_path
 from tint_sumo.stores import Store
 from tint_sumo.study.budgets import Budget, Conditions, Trials
 from tint_sumo.study.evaluation import evaluate
 from tint_sumo.study.evaluation_jobs import evaluate_on
 from tint_sumo.study.grid import plan
 from tint_sumo.study.loading import load_policy
-from tint_sumo.study.policy_jobs import TrainJob
+from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'tint_sumo[ray]'")
 
@@ -215,6 +216,20 @@ def test_a_training_survives_a_node_with_its_checkpoint(
     assert not (job.folder / "checkpoint.zip").exists()
 
 
+@pytest.mark.long
+def test_an_evaluation_survives_a_node(nodes: Nodes, cluster: Executor, tmp_path: Path) -> None:
+    trials = (Trials((Conditions(0.4),), 600),)
+    here, there = (EvaluateJob("oracle", None, 0, trials, tmp_path / name) for name in ("here", "there"))
+    Local(1).run([here], progress=False)
+    with meanwhile(lambda: cluster.run([there], progress=False)):
+        wait_until((there.out / log_path(there.name)).exists)
+        assert not there.is_done()
+        for _ in range(NODES):  # one of them does the job
+            nodes.kill(0)
+        nodes.add()
+    assert there.result_file.read_bytes() == here.result_file.read_bytes()
+
+
 DRIVER = """
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -228,7 +243,7 @@ if __name__ == "__main__":
     address, out = sys.argv[1], Path(sys.argv[2])
     try:
         with ray_cluster(address) as cluster:
-            cluster.run([CountJob(name, out, 50) for name in ("first", "second")])
+            cluster.run([CountJob(name, out, 120) for name in ("first", "second")])
     except KeyboardInterrupt:
         sys.exit(130)
 """
@@ -244,15 +259,15 @@ def driver(nodes: Nodes, out: Path) -> "subprocess.Popen[bytes]":
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
 def test_a_driver_that_ends_goes_on_with_the_same_call(nodes: Nodes, tmp_path: Path, sent: signal.Signals) -> None:
     nodes.restore()
-    jobs = [CountJob(name, tmp_path, 50) for name in ("first", "second")]
+    jobs = [CountJob(name, tmp_path, 120) for name in ("first", "second")]
     process = driver(nodes, tmp_path)
     wait_until(lambda: all(job.numbers for job in jobs))
     process.send_signal(sent)
     assert process.wait(PATIENCE_S) == (130 if sent == signal.SIGINT else -sent)
     left = [len(job.numbers) for job in jobs]
-    assert all(0 < count < 50 for count in left)
+    assert all(0 < count < 120 for count in left)
     assert driver(nodes, tmp_path).wait(PATIENCE_S) == 0
-    assert [job.numbers for job in jobs] == [list(range(50))] * 2
+    assert [job.numbers for job in jobs] == [list(range(120))] * 2
     assert [job.begins for job in jobs] == [[0, count] for count in left]
 
 

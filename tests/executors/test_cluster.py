@@ -196,6 +196,7 @@ def files(out: Path) -> dict[str, bytes]:
     return {path: file.read_bytes() for path, file in made.items() if not any(part in path for part in timed)}
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_a_training_survives_a_node_with_its_checkpoint(
     nodes: Nodes, cluster: Executor, brief: PpoSettings, tmp_path: Path
@@ -216,6 +217,7 @@ def test_a_training_survives_a_node_with_its_checkpoint(
     assert not (job.folder / "checkpoint.zip").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_an_evaluation_survives_a_node(nodes: Nodes, cluster: Executor, tmp_path: Path) -> None:
     trials = (Trials((Conditions(0.4),), 600),)
@@ -271,6 +273,7 @@ def test_a_driver_that_ends_goes_on_with_the_same_call(nodes: Nodes, tmp_path: P
     assert [job.begins for job in jobs] == [[0, count] for count in left]
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_twenty_kills_lose_nothing(nodes: Nodes, cluster: Executor, many_shards: Path, tmp_path: Path) -> None:
     """Nodes die at random moments, some of them before they have begun to work, and others join."""

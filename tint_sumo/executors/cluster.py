@@ -24,7 +24,7 @@ from ray.exceptions import RayError, RayTaskError
 import tint_sumo
 from tint_sumo.changes import Changes, file_states, read_files, write_files
 from tint_sumo.errors import InputError, JobError
-from tint_sumo.executors.jobs import MAX_FAILURES, MAX_LOSSES, Begun, Ended, Job, News, Work, run_jobs
+from tint_sumo.executors.jobs import ALLOWED, Begun, Ended, Job, News, Work, last_line, run_jobs
 from tint_sumo.executors.process import INTERRUPT_S, JobProcess, log_path
 from tint_sumo.processes import Told, told
 from tint_sumo.progress import Progress
@@ -35,8 +35,6 @@ LOOK_INTERVAL_S = 2.0  # so often a job's outputs are looked at, and its news se
 ANSWER_S = 5.0  # so long a cluster may take to answer
 PIECES_PER_CPU = 2  # pieces that are done or wait on a CPU: nobody is idle while results travel
 _HEAD = {"node:__internal_head__": 0.001}  # Ray's resource that only the head node has
-
-_ALLOWED = {"refused": 1, "failed": MAX_FAILURES, "lost": MAX_LOSSES}
 
 Files = Mapping[str, bytes | None]  # contents by path relative to a folder
 
@@ -165,9 +163,8 @@ class _Piece(Generic[T]):
             if how == "refused":
                 raise InputError(str(content))
             self._ends[how] += 1
-            if self._ends[how] >= _ALLOWED[how]:
-                reason = str(content).strip().splitlines()[-1]
-                raise JobError(f"piece {self._number} {how} {self._ends[how]} times: {reason}")
+            if self._ends[how] >= ALLOWED[how]:
+                raise JobError(f"piece {self._number} {how} {self._ends[how]} times: {last_line(str(content))}")
             self._task = self._submit()
 
     def _wait(self) -> tuple[str, Any]:

@@ -16,8 +16,8 @@ T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
 THREADS_PER_JOB = 1  # threads of torch: the jobs share the cores among them
-MAX_FAILURES = 3  # failures after which a job is given up
-MAX_LOSSES = 20  # losses of a job, with the machines that did it, after which it is given up
+# After how many runs that have ended like this work is given up; it is lost with the machine that did it.
+ALLOWED = {"refused": 1, "failed": 3, "lost": 20}
 REFRESH_S = 1.0
 
 
@@ -158,7 +158,7 @@ def _tell(table: JobTable, ledger: "_Ledger", job: Job, news: News) -> None:
         table.end(job.title, news.text)
     else:
         count, allowed = ledger.note_failure(job, news)
-        table.fail(job.title, f"{news.how}, {count} of {allowed} times: {_last_line(news.text)}", again=count < allowed)
+        table.fail(job.title, f"{news.how}, {count} of {allowed} times: {last_line(news.text)}", again=count < allowed)
         for skipped in ledger.skip():
             table.fail(skipped.title, "skipped, because it needs a job that was given up", again=False)
 
@@ -192,7 +192,7 @@ class _Ledger:
         self.started.remove(job)
         self._failures[job.name, ended.how] += 1
         count = self._failures[job.name, ended.how]
-        allowed = {"refused": 1, "failed": MAX_FAILURES, "lost": MAX_LOSSES}[ended.how]
+        allowed = ALLOWED[ended.how]
         if count < allowed:
             self.waiting.insert(0, job)
         else:
@@ -212,7 +212,7 @@ class _Ledger:
     def require_all_done(self) -> None:
         if not self._given_up:
             return
-        reasons = "; ".join(f"{name}: {_last_line(ended.text)}" for name, ended in self._given_up.items())
+        reasons = "; ".join(f"{name}: {last_line(ended.text)}" for name, ended in self._given_up.items())
         skipped = f"; skipped, because they need these: {', '.join(self._skipped)}" if self._skipped else ""
         text = f"{reasons}{skipped}. All other jobs are done; the same command tries these again"
         if all(ended.how == "refused" for ended in self._given_up.values()):
@@ -220,6 +220,6 @@ class _Ledger:
         raise JobError(f"jobs failed: {text}")
 
 
-def _last_line(text: str) -> str:
+def last_line(text: str) -> str:
     """Of a traceback, the error."""
     return (text.strip().splitlines() or ["no reason is known"])[-1]

@@ -14,7 +14,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -122,10 +122,8 @@ class RayCluster:
 
     def _ahead(self, work: Work[T], numbers: Iterator[int], pending: "deque[_Piece[T]]") -> Iterator[T]:
         while True:
-            for number in numbers:
-                pending.append(_Piece(work, number))
-                if len(pending) >= PIECES_PER_CPU * self.slots:
-                    break
+            free = PIECES_PER_CPU * self.slots - len(pending)  # nodes come and go
+            pending.extend(_Piece(work, number) for number in islice(numbers, max(free, 0)))
             if not pending:
                 return
             yield pending[0].result()

@@ -37,7 +37,7 @@ pytest.importorskip("ray", reason="Ray is not installed: pip install 'tint_sumo[
 
 from ray.cluster_utils import Cluster
 
-from tint_sumo.executors.cluster import ray_cluster
+from tint_sumo.executors.cluster import LOOK_INTERVAL_S, ray_cluster
 
 NODES = 3
 MANY_WINDOWS = 60_000  # some seconds' work
@@ -148,26 +148,38 @@ def test_a_recording_survives_a_node(nodes: Nodes, cluster: Executor, many_shard
 def test_a_job_goes_on_from_what_it_had_left_when_its_node_dies(
     nodes: Nodes, cluster: Executor, tmp_path: Path
 ) -> None:
-    jobs = [CountJob(f"count{number}", tmp_path, 60) for number in range(NODES)]
+    gate = tmp_path / "gate"
+    jobs = [CountJob(f"count{number}", tmp_path, 20, gate) for number in range(NODES)]
 
     with meanwhile(lambda: cluster.run(jobs, progress=False)):
         wait_until(lambda: all(job.numbers for job in jobs))
         nodes.kill(0)
-    assert [job.numbers for job in jobs] == [list(range(60))] * NODES
+        nodes.add()
+        wait_until(lambda: any(len(job.begins) == 2 for job in jobs))
+        gate.touch()
+    assert [job.numbers for job in jobs] == [list(range(20))] * NODES
     begins = sorted(job.begins for job in jobs)
     assert begins[:-1] == [[0]] * (NODES - 1)
     first, second = begins[-1]
     assert first == 0 < second
 
 
-def test_a_node_that_joins_is_used(nodes: Nodes, cluster: Executor, tmp_path: Path) -> None:
-    jobs = [CountJob(f"count{number}", tmp_path, 80) for number in range(NODES + 1)]
+def test_a_node_does_one_job_at_a_time_and_one_that_joins_is_used(
+    nodes: Nodes, cluster: Executor, tmp_path: Path
+) -> None:
+    gate = tmp_path / "gate"
+    jobs = [CountJob(f"count{number}", tmp_path, 2, gate) for number in range(NODES + 2)]
+
+    def begun() -> int:
+        return sum(bool(job.numbers) for job in jobs)
 
     with meanwhile(lambda: cluster.run(jobs, progress=False)):
-        wait_until(lambda: sum(bool(job.numbers) for job in jobs) == NODES)
+        wait_until(lambda: begun() >= NODES)
+        time.sleep(2 * LOOK_INTERVAL_S)  # all jobs have sent their news meanwhile
+        assert begun() == NODES
         nodes.add()
-        wait_until(lambda: all(job.numbers for job in jobs))
-        assert not any(job.is_done() for job in jobs)
+        wait_until(lambda: begun() == NODES + 1)
+        gate.touch()
     nodes.kill(0)
 
 
@@ -239,13 +251,14 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tests.executors.jobs import CountJob
-from tint_sumo.executors.cluster import ray_cluster
+from tint_sumo.executors.cluster import LOOK_INTERVAL_S, ray_cluster
 
 if __name__ == "__main__":
     address, out = sys.argv[1], Path(sys.argv[2])
+    jobs = [CountJob(name, out, 20, out / "gate") for name in ("first", "second")]
     try:
         with ray_cluster(address) as cluster:
-            cluster.run([CountJob(name, out, 120) for name in ("first", "second")])
+            cluster.run(jobs)
     except KeyboardInterrupt:
         sys.exit(130)
 """
@@ -261,15 +274,16 @@ def driver(nodes: Nodes, out: Path) -> "subprocess.Popen[bytes]":
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
 def test_a_driver_that_ends_goes_on_with_the_same_call(nodes: Nodes, tmp_path: Path, sent: signal.Signals) -> None:
     nodes.restore()
-    jobs = [CountJob(name, tmp_path, 120) for name in ("first", "second")]
+    jobs = [CountJob(name, tmp_path, 20) for name in ("first", "second")]
     process = driver(nodes, tmp_path)
     wait_until(lambda: all(job.numbers for job in jobs))
     process.send_signal(sent)
     assert process.wait(PATIENCE_S) == (130 if sent == signal.SIGINT else -sent)
     left = [len(job.numbers) for job in jobs]
-    assert all(0 < count < 120 for count in left)
+    assert all(0 < count < 20 for count in left)
+    (tmp_path / "gate").touch()
     assert driver(nodes, tmp_path).wait(PATIENCE_S) == 0
-    assert [job.numbers for job in jobs] == [list(range(120))] * 2
+    assert [job.numbers for job in jobs] == [list(range(20))] * 2
     assert [job.begins for job in jobs] == [[0, count] for count in left]
 
 

@@ -234,7 +234,7 @@ class _Tasks:
         number = next(self._numbers)
         files = {path: self._send(job.out / path, state) for path, state in file_states(job.out, _paths(job))}
         task = _do_job.options(name=job.name, num_gpus=self._gpus_per_job if job.uses_gpu else 0.0)
-        ref = task.remote(job, number, list(files), list(files.values()), self._mailbox, tint_sumo.__version__)
+        ref = task.remote(job, number, self._mailbox, tint_sumo.__version__, list(files), *files.values())
         self._tasks[number] = _Task(job, ref)
 
     def _send(self, file: Path, state: tuple[int, int]) -> Any:
@@ -318,12 +318,12 @@ class _Mailbox:
 
 @ray.remote(num_cpus=1, max_retries=0)  # jobs that are lost are counted, and submitted with their last checkpoint
 def _do_job(
-    job: Job, number: int, paths: Sequence[str], contents: Sequence[Any], mailbox: Any, version: str
+    job: Job, number: int, mailbox: Any, version: str, paths: Sequence[str], *contents: bytes
 ) -> tuple[Ended, Files]:
     """Do a job in a scratch folder that holds some files; how it ended, and what it has left since its last message."""
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as scratch:
         folder = Path(scratch)
-        write_files(folder, dict(zip(paths, ray.get(list(contents)), strict=True)))
+        write_files(folder, dict(zip(paths, contents, strict=True)))
         try:
             placed = _placed(job, folder, version)
         except InputError as error:
@@ -331,7 +331,8 @@ def _do_job(
         changes = Changes(folder, (*job.outputs, log_path(job.name)))
 
         def post(news: News | None) -> bool:
-            return bool(ray.get(mailbox.post.remote(number, news, changes.take(time.time()))))
+            # Not ray.get: a task that waits there lends its CPU to another one, which then keeps it to its end.
+            return bool(mailbox.post.remote(number, news, changes.take(time.time())).future().result())
 
         process = JobProcess(placed)
         try:

@@ -21,8 +21,9 @@ from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.recorder import record
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import Case, Evaluation
+from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.methods import METHODS, Learned
-from tint_sumo.study.results import GIVEN, RESULTS, Measured, Result
+from tint_sumo.study.results import GIVEN, Measured, Result
 from tint_sumo.traits.storage import save
 
 PATIENCE_S = 100.0

@@ -7,7 +7,8 @@ from tint_sumo.config import Share
 from tint_sumo.files import write_json
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.evaluation import Case, Evaluation
-from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Measured, Result
+from tint_sumo.study.folders import RESULTS
+from tint_sumo.study.results import GIVEN, TRAINED, Measured, Result
 
 
 def evaluation(success: int, timeout: int, collision: int) -> Evaluation:

@@ -10,8 +10,9 @@ from tint_sumo.config import Idm
 from tint_sumo.errors import InputError
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.evaluation import TUNING_CASES
+from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.report import write_report
-from tint_sumo.study.results import RESULTS, Result, read_results
+from tint_sumo.study.results import Result, read_results
 
 SOME_RESULTS = [
     trained("oracle", 1, {Conditions(0.4): (8, 1, 1), Conditions(ALL_MIXES, 0.05, 0.7, 25): (3, 0, 2)}),

@@ -11,7 +11,7 @@ import pytest
 from tint_sumo.config import TraitSettings
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
-from tint_sumo.study.results import RESULTS
+from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.trait_report import aggregate, to_markdown, write_trait_report
 from tint_sumo.study.trait_study import CompareJob, TraitStudy, run_trait_study
 

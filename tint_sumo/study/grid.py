@@ -10,12 +10,13 @@ from tint_sumo.files import claim_folder
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, digest_of, find_scene
 from tint_sumo.study.budgets import Budget
 from tint_sumo.study.ceiling_job import CeilingJob
+from tint_sumo.study.folders import DATASET
 from tint_sumo.study.loading import shipped_policies
 from tint_sumo.study.methods import Learned, find_method
 from tint_sumo.study.page import write_page
 from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
 from tint_sumo.study.report import StudyReport, write_report
-from tint_sumo.study.trait_job import DATASET, SEED, TraitJob
+from tint_sumo.study.trait_job import SEED, TraitJob
 
 
 def plan(budget: Budget, out: Path, scene: str | Scene = T_INTERSECTION) -> list[Job]:

@@ -17,11 +17,11 @@ from tint_sumo.scenes import T_INTERSECTION, AnyScene
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Conditions, Trials
 from tint_sumo.study.evaluation import CASES, Evaluation, evaluate
+from tint_sumo.study.folders import RESULTS, trait_folder
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import METHODS, Rule, find_learned, find_method
-from tint_sumo.study.results import GIVEN, RESULTS, TRAINED, Measured, Result
+from tint_sumo.study.results import GIVEN, TRAINED, Measured, Result
 from tint_sumo.study.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
-from tint_sumo.study.trait_job import trait_folder
 
 _SMOOTHED = 5  # points of a learning curve
 

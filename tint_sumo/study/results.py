@@ -10,8 +10,8 @@ from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import CASES, Case, Evaluation
+from tint_sumo.study.folders import RESULTS
 
-RESULTS = "results"  # folder of the results in a study's folder
 TRAINED, GIVEN = "trained", "given"  # origin of a policy: the study itself, or a rule or the package
 
 

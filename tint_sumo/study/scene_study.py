@@ -20,13 +20,13 @@ from tint_sumo.progress import Report
 from tint_sumo.scenes import SCENES, T_INTERSECTION
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import TRAIT_BUDGETS
+from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.tables import markdown_table
 from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, fit_line
 from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.training import train
 
 SPEED = "desired_speed_mps"
-_RESULTS = "results"
 _POPULATIONS = ("traits", "continuous")
 
 
@@ -123,7 +123,7 @@ class TransferJob:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        return f"models/{self.name}", f"{_RESULTS}/{self.name}.json"
+        return f"models/{self.name}", f"{RESULTS}/{self.name}.json"
 
     @property
     def _result_file(self) -> Path:
@@ -188,7 +188,7 @@ class TransferJob:
 
 
 def _report(out: Path) -> pd.DataFrame:
-    found = [read_json(file, "result of the study") for file in sorted((out / _RESULTS).glob("*.json"))]
+    found = [read_json(file, "result of the study") for file in sorted((out / RESULTS).glob("*.json"))]
     keys = ("method", "trained_on", "seed")
     table = pd.DataFrame([{key: one[key] for key in keys} | row for one in found for row in one["scenes"]])
     write_text(out / "scenes.csv", table.to_csv(index=False))

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binomtest, bootstrap
 
 Interval = tuple[float, float]
 Hits = NDArray[np.bool_]  # (S, C): whether policies of S training seeds had some outcome in the same C cases
@@ -28,6 +27,8 @@ class Rate:
     @property
     def interval(self) -> Interval:
         """Of one policy: it leaves out the spread between trainings."""
+        from scipy.stats import binomtest  # noqa: PLC0415 - loads for half a second, and trainings need none of it
+
         found = binomtest(self.count, self.total).proportion_ci(CONFIDENCE, method="wilson")
         return float(found.low), float(found.high)
 
@@ -49,6 +50,8 @@ def difference_interval(first: Hits, second: Hits) -> Interval:
 
 
 def _interval(samples: Sequence[NDArray[np.int64]], statistic: Callable[..., NDArray[np.float64]]) -> Interval:
+    from scipy.stats import bootstrap  # noqa: PLC0415 - as above
+
     found = bootstrap(
         samples,
         lambda *resampled, axis: statistic(*resampled),  # noqa: ARG005, PLW0108 - SciPy passes an axis

@@ -10,16 +10,11 @@ from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import write_json
 from tint_sumo.progress import Report
 from tint_sumo.standings import Title
+from tint_sumo.study.folders import DATASET, trait_folder
 from tint_sumo.study.trait_models import evaluate_traits, plot_traits, train_traits
 from tint_sumo.traits.storage import add_to_card
 
-DATASET = "dataset"  # folder of the dataset in a study's folder
 SEED = 0  # seed of the dataset and of the trait models
-
-
-def trait_folder(method: str) -> str:
-    """Folder of a trait model that a study trains, relative to the study's."""
-    return f"traits/{method}"
 
 
 @dataclass(frozen=True)

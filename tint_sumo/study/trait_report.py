@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, whole_file, write_text
-from tint_sumo.study.results import RESULTS
+from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.tables import markdown_table
 
 COLOURS = {"vae": "#1b6ca8", "cross_window": "#0b7a3b", "morton": "#c8682c", "classifier": "#555555"}

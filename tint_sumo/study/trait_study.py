@@ -16,7 +16,7 @@ from tint_sumo.files import claim_folder, write_json
 from tint_sumo.progress import Report, part_of
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import TRAIT_BUDGETS
-from tint_sumo.study.results import RESULTS
+from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.trait_models import train_on_split
 from tint_sumo.study.trait_report import TraitReport, write_trait_report
 from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, linear_r2

@@ -1,0 +1,9 @@
+"""Where a study keeps what, as paths relative to its folder."""
+
+DATASET = "dataset"
+RESULTS = "results"  # a file for each result
+
+
+def trait_folder(method: str) -> str:
+    """Folder of a trait model that the study trains."""
+    return f"traits/{method}"

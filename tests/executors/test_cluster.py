@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from tests.dataset.test_recorder import TWO_SHARDS, contents
@@ -310,6 +311,21 @@ def test_twenty_kills_lose_nothing(nodes: Nodes, cluster: Executor, many_shards:
     assert [job.numbers for job in jobs] == [list(range(120))] * (3 * NODES)
     assert min(kills_in.values()) >= 3
     assert sum(kills_in.values()) >= 20
+
+
+def test_no_other_machine_reaches_ray_on_this_one() -> None:
+    this = psutil.Process()
+    before = set(this.children(recursive=True))
+    with ray_cluster("local") as alone:
+        assert alone.slots == os.cpu_count()
+        begun = set(this.children(recursive=True)) - before
+        listening = {
+            one.laddr.ip.removeprefix("::ffff:")
+            for process in begun
+            for one in process.net_connections("inet")
+            if one.status == psutil.CONN_LISTEN
+        }
+    assert listening == {"127.0.0.1"}
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "ray://127.0.0.1", "nowhere"])

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import ray
+from ray._private import ray_constants
 from ray.exceptions import RayError, RayTaskError
 
 import tint_sumo
@@ -34,6 +35,7 @@ T = TypeVar("T")
 LOOK_INTERVAL_S = 2.0  # so often a job's outputs are looked at, and its news sent
 ANSWER_S = 5.0  # so long a cluster may take to answer
 PIECES_PER_CPU = 2  # pieces that are done or wait on a CPU: nobody is idle while results travel
+_OPTIONS: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
 _HEAD = {"node:__internal_head__": 0.001}  # Ray's resource that only the head node has
 
 Files = Mapping[str, bytes | None]  # contents by path relative to a folder
@@ -45,8 +47,8 @@ def ray_cluster(address: str = "auto", gpus_per_job: float = 0.0) -> Iterator["R
 
     Args:
         address: ``ray://host:port`` of a cluster, ``host:port`` of one that this machine is a node of, ``"local"`` for
-            Ray on this machine alone, or ``"auto"``: the cluster that this machine is a node of or, if there is none,
-            ``"local"``.
+            Ray on this machine alone, where no other machine reaches it, or ``"auto"``: the cluster that this machine
+            is a node of or, if there is none, ``"local"``.
         gpus_per_job: share of a GPU that each job has that a GPU makes faster, if the cluster has GPUs.
 
     Raises:
@@ -66,16 +68,31 @@ def ray_cluster(address: str = "auto", gpus_per_job: float = 0.0) -> Iterator["R
 def _connect(address: str) -> str:
     """Connect this process; where the cluster's dashboard is."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody is told of what runs here
-    options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
-    if address not in ("auto", "local"):
+    if address == "local":
+        return _start()
+    if address != "auto":
         _require_answer(address)
     try:
-        context = ray.init(address, **options)
+        return ray.init(address, **_OPTIONS).dashboard_url or ""
     except ConnectionError:
         if address != "auto":
             raise
-        context = ray.init("local", **options)
-    return context.dashboard_url or ""
+        return _start()
+
+
+def _start() -> str:
+    """Start Ray on this machine, on the loopback interface alone, as it does of itself on macOS; its dashboard."""
+    name = ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR  # for the processes that begin here
+    before = os.environ.get(name), ray_constants.ENABLE_RAY_CLUSTER
+    os.environ[name], ray_constants.ENABLE_RAY_CLUSTER = "0", False
+    try:
+        return ray.init("local", **_OPTIONS).dashboard_url or ""
+    finally:
+        _, ray_constants.ENABLE_RAY_CLUSTER = before
+        if before[0] is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before[0]
 
 
 def _require_answer(address: str) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 PROVENANCE_FILE = "provenance.json"
 CONFIG_FILE = "config.yaml"
 _CHECKOUT = Path(__file__).resolve().parents[1]
-_PACKAGES = (
+PACKAGES = (  # whose versions may change a result
     "tint_sumo",
     "libsumo",
     "torch",
@@ -38,7 +38,7 @@ class Origin:
     def provenance(self, *, with_versions: bool) -> dict[str, Any]:
         """What JSON can hold of it, and of the code."""
         told = {"command": shlex.join(["tint-sumo", *self.words]), "commit": commit()}
-        return {**told, "versions": versions(_PACKAGES)} if with_versions else told
+        return {**told, "versions": versions(PACKAGES)} if with_versions else told
 
 
 _ORIGIN: ContextVar[Origin | None] = ContextVar("origin", default=None)

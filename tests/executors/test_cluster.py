@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ pytest.importorskip("ray", reason="Ray is not installed: pip install 'tint_sumo[
 
 from ray.cluster_utils import Cluster
 
-from tint_sumo.executors.cluster import LOOK_INTERVAL_S, ray_cluster
+from tint_sumo.executors.cluster import LOOK_INTERVAL_S, _versions, ray_cluster
 
 NODES = 3
 MANY_WINDOWS = 60_000  # some seconds' work
@@ -128,6 +129,21 @@ def test_a_job_that_fails_is_named_and_the_others_finish(
     assert (bad.tries, good.is_done(), child.tries) == (tries, True, 0)
     log = (tmp_path / "logs" / "bad.log").read_text()
     assert log == ("this is not for me\n" if failure == "refused" else "")
+
+
+def test_a_node_with_other_versions_does_nothing(
+    cluster: Executor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = version("torch").partition("+")[0]
+    with monkeypatch.context() as other:
+        other.setattr("tint_sumo.executors.cluster._versions", lambda: _versions() | {"torch": "1.0"})
+        job = FileJob("one", tmp_path)
+        text = f"a node of the cluster has torch {own}, and this machine has torch 1.0; install the same everywhere"
+        with pytest.raises(InputError, match=text):
+            cluster.run([job], progress=False)
+        with pytest.raises(InputError, match=text):
+            record(tmp_path / "data", 100, workers=cluster, progress=False)
+    assert job.tries == 0
 
 
 def test_a_recording_is_the_same_byte_for_byte(cluster: Executor, two_shards: Path, tmp_path: Path) -> None:
@@ -250,9 +266,10 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from tests.executors.jobs import CountJob
-from tint_sumo.executors.cluster import LOOK_INTERVAL_S, ray_cluster
+from tint_sumo.executors.cluster import LOOK_INTERVAL_S, _versions, ray_cluster
 
 if __name__ == "__main__":
     address, out = sys.argv[1], Path(sys.argv[2])

@@ -14,6 +14,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib.metadata import version
 from itertools import count, islice
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -22,13 +24,13 @@ import ray
 from ray._private import ray_constants
 from ray.exceptions import RayError, RayTaskError
 
-import tint_sumo
 from tint_sumo.changes import Changes, file_states, read_files, write_files
 from tint_sumo.errors import InputError, JobError
 from tint_sumo.executors.jobs import ALLOWED, Begun, Ended, Job, News, Work, last_line, run_jobs
 from tint_sumo.executors.process import INTERRUPT_S, JobProcess, log_path
 from tint_sumo.processes import Told, told
 from tint_sumo.progress import Progress
+from tint_sumo.provenance import PACKAGES
 
 T = TypeVar("T")
 
@@ -161,7 +163,7 @@ class _Piece(Generic[T]):
 
     def _submit(self) -> Any:
         files = read_files(self._work.out, self._work.paths(self._number))
-        return _do_piece.remote(self._work, self._number, files, tint_sumo.__version__)
+        return _do_piece.remote(self._work, self._number, files, _versions())
 
     def result(self) -> T:
         """Wait for what it gives.
@@ -203,26 +205,31 @@ def _lost_or_failed(error: RayError) -> tuple[str, str]:
 
 
 @ray.remote(num_cpus=1, max_retries=0)  # pieces that are lost are counted, and submitted with what is there by then
-def _do_piece(work: Work[Any], number: int, files: Files, version: str) -> tuple[Told, Files]:
+def _do_piece(work: Work[Any], number: int, files: Files, versions: Mapping[str, str]) -> tuple[Told, Files]:
     """Do a piece in a scratch folder that holds some files; what came out, and the files that it has left."""
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as scratch:
         folder = Path(scratch)
         write_files(folder, files)
         changes = Changes(folder, work.paths(number))
-        return told(lambda: _placed(work, folder, version)(number)), changes.take()
+        return told(lambda: _placed(work, folder, versions)(number)), changes.take()
 
 
-def _placed(work: Any, folder: Path, version: str) -> Any:
+@cache
+def _versions() -> dict[str, str]:
+    """Versions of what may change a result; builds of one version, such as ``2.13.0+cpu``, count as the same."""
+    return {name: version(name).partition("+")[0] for name in PACKAGES}
+
+
+def _placed(work: Any, folder: Path, versions: Mapping[str, str]) -> Any:
     """A job, or pieces of work, in another folder.
 
     Raises:
-        InputError: this node has another version of the package than the driver, and might do another thing.
+        InputError: this node has other versions than the driver, and might do another thing.
     """
-    if version != tint_sumo.__version__:
-        raise InputError(
-            f"a node of the cluster has tint_sumo {tint_sumo.__version__}, and this machine has {version}; "
-            "install the same everywhere"
-        )
+    differing = [name for name, own in _versions().items() if versions[name] != own]
+    if differing:
+        own, theirs = (", ".join(f"{name} {of[name]}" for name in differing) for of in (_versions(), versions))
+        raise InputError(f"a node of the cluster has {own}, and this machine has {theirs}; install the same everywhere")
     return replace(work, out=folder)
 
 
@@ -251,7 +258,7 @@ class _Tasks:
         number = next(self._numbers)
         files = {path: self._send(job.out / path, state) for path, state in file_states(job.out, _paths(job))}
         task = _do_job.options(name=job.name, num_gpus=self._gpus_per_job if job.uses_gpu else 0.0)
-        ref = task.remote(job, number, self._mailbox, tint_sumo.__version__, list(files), *files.values())
+        ref = task.remote(job, number, self._mailbox, _versions(), list(files), *files.values())
         self._tasks[number] = _Task(job, ref)
 
     def _send(self, file: Path, state: tuple[int, int]) -> Any:
@@ -335,14 +342,14 @@ class _Mailbox:
 
 @ray.remote(num_cpus=1, max_retries=0)  # jobs that are lost are counted, and submitted with their last checkpoint
 def _do_job(
-    job: Job, number: int, mailbox: Any, version: str, paths: Sequence[str], *contents: bytes
+    job: Job, number: int, mailbox: Any, versions: Mapping[str, str], paths: Sequence[str], *contents: bytes
 ) -> tuple[Ended, Files]:
     """Do a job in a scratch folder that holds some files; how it ended, and what it has left since its last message."""
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as scratch:
         folder = Path(scratch)
         write_files(folder, dict(zip(paths, contents, strict=True)))
         try:
-            placed = _placed(job, folder, version)
+            placed = _placed(job, folder, versions)
         except InputError as error:
             return Ended("refused", str(error)), {}
         changes = Changes(folder, (*job.outputs, log_path(job.name)))

@@ -26,7 +26,7 @@ from ray.exceptions import RayError, RayTaskError
 
 from tint_sumo.changes import Changes, file_states, read_files, write_files
 from tint_sumo.errors import InputError, JobError
-from tint_sumo.executors.jobs import ALLOWED, Begun, Ended, Job, News, Work, last_line, run_jobs
+from tint_sumo.executors.jobs import ALLOWED, Begun, Ended, How, Job, News, Work, last_line, run_jobs
 from tint_sumo.executors.process import INTERRUPT_S, JobProcess, log_path
 from tint_sumo.processes import Told, told
 from tint_sumo.progress import Progress
@@ -174,7 +174,7 @@ class _Piece(Generic[T]):
         if self._is_here:
             return self._work(self._number)
         while True:
-            how, content = self._wait()
+            how, content = _end_of(self._task, self._work.out)
             if how == "done":
                 return content  # type: ignore[no-any-return]
             if how == "refused":
@@ -184,24 +184,21 @@ class _Piece(Generic[T]):
                 raise JobError(f"piece {self._number} {how} {self._ends[how]} times: {last_line(str(content))}")
             self._task = self._submit()
 
-    def _wait(self) -> tuple[str, Any]:
-        try:
-            message, files = ray.get(self._task)
-        except RayError as error:
-            return _lost_or_failed(error)
-        write_files(self._work.out, files)
-        return message  # type: ignore[no-any-return]
-
     def cancel(self) -> None:
         if self._task is not None:
             ray.cancel(self._task, force=True)
 
 
-def _lost_or_failed(error: RayError) -> tuple[str, str]:
-    """What became of a task that has returned nothing: it raised an error, or went with its machine."""
-    if isinstance(error, RayTaskError):
+def _end_of(task: Any, out: Path) -> tuple[How, Any]:
+    """How a task ended, and what it gave or what is to be said of it; the files that it has left are written."""
+    try:
+        (how, content), files = ray.get(task)
+    except RayTaskError as error:
         return "failed", str(error.cause)
-    return "lost", _first_line(error)
+    except RayError as error:
+        return "lost", _first_line(error)
+    write_files(out, files)
+    return how, content
 
 
 @ray.remote(num_cpus=1, max_retries=0)  # pieces that are lost are counted, and submitted with what is there by then
@@ -278,7 +275,7 @@ class _Tasks:
         news = [told for message in ray.get(self._mailbox.take.remote()) for told in self._read(*message)]
         for ref in ended:
             task = self._tasks.pop(refs[ref])
-            news.append((task.job, _end_of(task)))
+            news.append((task.job, Ended(*_end_of(task.ref, task.job.out))))
         return news
 
     def _read(self, number: int, news: News | None, files: Files) -> list[tuple[Job, News]]:
@@ -308,17 +305,6 @@ def _paths(job: Job) -> tuple[str, ...]:
     return (*job.inputs, *job.outputs, log_path(job.name))
 
 
-def _end_of(task: _Task) -> Ended:
-    try:
-        ended, files = ray.get(task.ref)
-    except RayError as error:
-        how, text = _lost_or_failed(error)
-        return Ended(how, text)  # type: ignore[arg-type]
-    write_files(task.job.out, files)
-    assert isinstance(ended, Ended)
-    return ended
-
-
 @ray.remote(num_cpus=0, resources=_HEAD)
 class _Mailbox:
     """Holds what jobs tell until the driver takes it. It is on the head node, without which there is no cluster."""
@@ -343,7 +329,7 @@ class _Mailbox:
 @ray.remote(num_cpus=1, max_retries=0)  # jobs that are lost are counted, and submitted with their last checkpoint
 def _do_job(
     job: Job, number: int, mailbox: Any, versions: Mapping[str, str], paths: Sequence[str], *contents: bytes
-) -> tuple[Ended, Files]:
+) -> tuple[tuple[How, str], Files]:
     """Do a job in a scratch folder that holds some files; how it ended, and what it has left since its last message."""
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as scratch:
         folder = Path(scratch)
@@ -351,7 +337,7 @@ def _do_job(
         try:
             placed = _placed(job, folder, versions)
         except InputError as error:
-            return Ended("refused", str(error)), {}
+            return ("refused", str(error)), {}
         changes = Changes(folder, (*job.outputs, log_path(job.name)))
 
         def post(news: News | None) -> bool:
@@ -364,7 +350,7 @@ def _do_job(
         finally:
             process.interrupt()
             process.join()
-        return ended, changes.take()
+        return (ended.how, ended.text), changes.take()
 
 
 def _attend(process: JobProcess, post: Callable[[News | None], bool]) -> Ended:

@@ -104,11 +104,14 @@ class Begun:
     """A job is being done from now on."""
 
 
+How = Literal["done", "refused", "failed", "lost"]  # lost: with its machine
+
+
 @dataclass(frozen=True)
 class Ended:
     """How a run of a job ended, and what is to be said of it."""
 
-    how: Literal["done", "refused", "failed", "lost"]  # lost: with its machine
+    how: How
     text: str = ""
 
 

@@ -6,6 +6,7 @@ Run as root on Linux with control groups of version 1, which limit the nodes: py
 import tempfile
 import time
 from pathlib import Path
+from statistics import median
 
 from ray.cluster_utils import Cluster
 
@@ -18,6 +19,7 @@ CPU_GROUPS = Path("/sys/fs/cgroup/cpu")
 PERIOD_US = 100_000
 CORES_PER_NODE = 0.5
 WINDOWS, EPISODES = 200_000, 1600
+REPEATS = 3
 MODEL = "oracle"
 
 
@@ -48,17 +50,27 @@ def evaluation_s(cluster: RayCluster) -> float:
     return time.perf_counter() - began_s
 
 
+def times_s(nodes: int) -> tuple[float, float]:
+    """On a cluster that has just started."""
+    cluster = limited_cluster(nodes)
+    try:
+        with ray_cluster(cluster.address) as found:
+            return recording_s(found), evaluation_s(found)
+    finally:
+        cluster.shutdown()
+
+
 def main() -> None:
-    print("nodes  recording  efficiency  evaluation  efficiency")
+    times_s(2)  # reads the libraries from the disk
+    print("nodes  recording  efficiency  evaluation  efficiency  all runs")
     alone: list[float] = []
     for nodes in (1, 2, 4):
-        cluster = limited_cluster(nodes)
-        with ray_cluster(cluster.address) as found:
-            times_s = [recording_s(found), evaluation_s(found)]
-        cluster.shutdown()
-        alone = alone or times_s
-        shares = [one / (nodes * spent) for one, spent in zip(alone, times_s, strict=True)]
-        print(f"{nodes:5}  {times_s[0]:7.1f} s  {shares[0]:10.0%}  {times_s[1]:8.1f} s  {shares[1]:10.0%}", flush=True)
+        runs = [times_s(nodes) for _ in range(REPEATS)]
+        medians_s = [median(of_kind) for of_kind in zip(*runs, strict=True)]
+        alone = alone or medians_s
+        shares = [one / (nodes * spent) for one, spent in zip(alone, medians_s, strict=True)]
+        columns = "".join(f"  {took:7.1f} s  {share:10.0%}" for took, share in zip(medians_s, shares, strict=True))
+        print(f"{nodes:5}{columns}  {runs}", flush=True)
 
 
 if __name__ == "__main__":

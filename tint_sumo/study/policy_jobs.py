@@ -140,15 +140,19 @@ class EvaluateJob:
     def result_file(self) -> Path:
         return self.out / self.outputs[0]
 
+    @property
+    def wanted(self) -> list[tuple[Conditions, int]]:
+        """Where it is tested, and with how many cases."""
+        return [(one, trials.episodes) for trials in self.trials for one in trials.conditions if self._meets(one)]
+
     def is_done(self) -> bool:
         return self.result_file.exists()
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        wanted = [(one, trials.episodes) for trials in self.trials for one in trials.conditions if self._meets(one)]
-        total, done = sum(episodes for _, episodes in wanted), 0
+        total, done = sum(episodes for _, episodes in self.wanted), 0
         tested: list[Measured] = []
-        for conditions, episodes in wanted:
+        for conditions, episodes in self.wanted:
             evaluation = self._test(conditions, episodes, part_of(report, done, total))
             tested.append(Measured(conditions, evaluation))
             done += episodes

@@ -3,6 +3,7 @@
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -14,7 +15,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 
 from tests.dataset.test_recorder import TWO_SHARDS, contents
@@ -330,19 +330,46 @@ def test_twenty_kills_lose_nothing(nodes: Nodes, cluster: Executor, many_shards:
     assert sum(kills_in.values()) >= 20
 
 
+LISTENING = """
+import psutil
+from tint_sumo.executors.cluster import ray_cluster
+
+with ray_cluster("local"):
+    for process in psutil.Process().children(recursive=True):
+        for one in process.net_connections("inet"):
+            if one.status == psutil.CONN_LISTEN:
+                print(one.laddr.ip.removeprefix("::ffff:"))
+"""
+
+
 def test_no_other_machine_reaches_ray_on_this_one() -> None:
-    this = psutil.Process()
-    before = set(this.children(recursive=True))
-    with ray_cluster("local") as alone:
-        assert alone.slots == os.cpu_count()
-        begun = set(this.children(recursive=True)) - before
-        listening = {
-            one.laddr.ip.removeprefix("::ffff:")
-            for process in begun
-            for one in process.net_connections("inet")
-            if one.status == psutil.CONN_LISTEN
-        }
-    assert listening == {"127.0.0.1"}
+    found = subprocess.run([sys.executable, "-c", LISTENING], capture_output=True, text=True, check=True)
+    assert set(found.stdout.split()) == {"127.0.0.1"}
+
+
+@pytest.fixture
+def elsewhere(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Address for clients of a cluster that this process is no part of."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "0" * 64)
+    with socket.create_server(("", 0)) as one, socket.create_server(("", 0)) as other:
+        port, client_port = one.getsockname()[1], other.getsockname()[1]
+    options = [f"--port={port}", f"--ray-client-server-port={client_port}", "--num-cpus=1", "--include-dashboard=false"]
+    ray_program = str(Path(sys.executable).with_name("ray"))
+    head = subprocess.Popen([ray_program, "start", "--head", "--block", *options], stdout=subprocess.DEVNULL)
+    yield f"ray://127.0.0.1:{client_port}"
+    head.terminate()
+    head.wait(PATIENCE_S)
+
+
+@pytest.mark.slow
+def test_a_command_uses_a_cluster_elsewhere(elsewhere: str, tmp_path: Path) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    record(here, 100, progress=False)
+    words = ["record", "--windows", "100", "--executor", "ray", "--address", elsewhere, "--out", str(there)]
+    command = [sys.executable, "-c", "import sys; from tint_sumo.cli import main; sys.exit(main())", *words]
+    wait_until(lambda: subprocess.run(command, capture_output=True, check=False).returncode == 0)
+    assert contents(there) == contents(here)
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "ray://127.0.0.1", "nowhere"])

@@ -1,4 +1,4 @@
-"""How much faster a recording and an evaluation are on more nodes: nodes of half a core each on this machine.
+"""How much faster a recording and an evaluation are on more nodes: nodes of 0.4 cores each on this machine.
 
 Run as root on Linux with control groups of version 1, which limit the nodes: python scripts/measure_cluster.py
 """
@@ -17,14 +17,14 @@ from tint_sumo.study.loading import load_policy
 
 CPU_GROUPS = Path("/sys/fs/cgroup/cpu")
 PERIOD_US = 100_000
-CORES_PER_NODE = 0.5
-WINDOWS, EPISODES = 200_000, 1600
+CORES_PER_NODE = 0.4  # four of them leave a part of two cores to the head and to the command
+WINDOWS, EPISODES = 400_000, 3200
 REPEATS = 3
 MODEL = "oracle"
 
 
 def limited_cluster(nodes: int) -> Cluster:
-    """A head that does no jobs, and nodes that have half a core for all of their processes together."""
+    """A head that does no jobs, and nodes that have 0.4 cores for all of their processes together."""
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     for number in range(nodes):
         node = cluster.add_node(num_cpus=1, object_store_memory=200 * 2**20)

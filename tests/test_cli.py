@@ -302,6 +302,7 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ("policy evaluate --model ttc --tau 0", "tau_s"),
         ("policy evaluate --model ttc --episodes 0", "episodes"),
         ("policy evaluate --model ttc --seed -1", "seed"),
+        ("policy sweep --set n_epochs=2 --set gamma=0.9 --out OUT", "--set is given twice; give it once"),
         ("study run --workers 0 --out OUT", "workers"),
         ("study report --out NOWHERE", "no results in"),
         ("render --model always_go --out film.avi", "a film ends in .mp4, .gif, .png"),

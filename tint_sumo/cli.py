@@ -836,8 +836,9 @@ def parse(words: list[str]) -> Command:
     """The command that the words of a command line say, with what its configuration file says.
 
     Raises:
-        InputError: the file is not there, or a value in it does not fit.
+        InputError: the file is not there, a value in it does not fit, or a flag comes twice.
     """
+    _require_each_once(words)
     file = config_of(words)
     *groups, kind = commands_named(TintSumo, words)
     if file is None or not issubclass(kind, Command):
@@ -851,6 +852,14 @@ def parse(words: list[str]) -> Command:
     while not isinstance(parsed, Command):
         parsed = parsed.command
     return parsed
+
+
+def _require_each_once(words: Sequence[str]) -> None:
+    """Raise InputError if a flag comes twice: what stands behind the first would be forgotten in silence."""
+    flags = [word.partition("=")[0] for word in words if word.startswith("--")]
+    for flag in flags:
+        if flags.count(flag) > 1:
+            raise InputError(f"{flag} is given twice; give it once, with all of its values behind it")
 
 
 def _completion_script(shell: str) -> str:

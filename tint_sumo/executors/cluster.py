@@ -255,7 +255,7 @@ class _Tasks:
         number = next(self._numbers)
         files = {path: self._send(job.out / path, state) for path, state in file_states(job.out, _paths(job))}
         task = _do_job.options(name=job.name, num_gpus=self._gpus_per_job if job.uses_gpu else 0.0)
-        ref = task.remote(job, number, self._mailbox, _versions(), list(files), *files.values())
+        ref = task.remote(job, number, self._mailbox, _versions(), list(files), list(files.values()))
         self._tasks[number] = _Task(job, ref)
 
     def _send(self, file: Path, state: tuple[int, int]) -> Any:
@@ -328,12 +328,13 @@ class _Mailbox:
 
 @ray.remote(num_cpus=1, max_retries=0)  # jobs that are lost are counted, and submitted with their last checkpoint
 def _do_job(
-    job: Job, number: int, mailbox: Any, versions: Mapping[str, str], paths: Sequence[str], *contents: bytes
+    job: Job, number: int, mailbox: Any, versions: Mapping[str, str], paths: Sequence[str], contents: Sequence[Any]
 ) -> tuple[tuple[How, str], Files]:
     """Do a job in a scratch folder that holds some files; how it ended, and what it has left since its last message."""
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as scratch:
         folder = Path(scratch)
-        write_files(folder, dict(zip(paths, contents, strict=True)))
+        for path, content in zip(paths, contents, strict=True):  # in memory one after the other
+            write_files(folder, {path: _wait_for(content)})
         try:
             placed = _placed(job, folder, versions)
         except InputError as error:
@@ -341,8 +342,7 @@ def _do_job(
         changes = Changes(folder, (*job.outputs, log_path(job.name)))
 
         def post(news: News | None) -> bool:
-            # Not ray.get: a task that waits there lends its CPU to another one, which then keeps it to its end.
-            return bool(mailbox.post.remote(number, news, changes.take(time.time())).future().result())
+            return bool(_wait_for(mailbox.post.remote(number, news, changes.take(time.time()))))
 
         process = JobProcess(placed)
         try:
@@ -351,6 +351,11 @@ def _do_job(
             process.interrupt()
             process.join()
         return (ended.how, ended.text), changes.take()
+
+
+def _wait_for(reference: Any) -> Any:
+    """What Ray holds or will hold. A job that waits in ``ray.get`` lends its CPU, and another one then keeps it."""
+    return reference.future().result()
 
 
 def _attend(process: JobProcess, post: Callable[[News | None], bool]) -> Ended:

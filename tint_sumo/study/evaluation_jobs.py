@@ -115,7 +115,8 @@ def evaluate_on(
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as folder:
         out = Path(folder)
         named = _copy_model(model, out)
-        count = min(MAX_CASES, BATCH * math.ceil(episodes / executor.slots / BATCH))
+        rounds = math.ceil(episodes / (MAX_CASES * executor.slots))  # each gives every slot a job of the same size
+        count = BATCH * math.ceil(episodes / (rounds * executor.slots * BATCH))
         jobs = [
             CasesJob(named, scene, allow_pickle, world, seed, first, min(count, episodes - first), out)
             for first in range(0, episodes, count)

@@ -136,8 +136,7 @@ class RayCluster:
         try:
             yield self._ahead(work, iter(numbers), pending)
         finally:
-            for piece in pending:
-                piece.cancel()
+            _cancel([piece.task for piece in pending if piece.task is not None])
 
     def _ahead(self, work: Work[T], numbers: Iterator[int], pending: "deque[_Piece[T]]") -> Iterator[T]:
         while True:
@@ -159,7 +158,7 @@ class _Piece(Generic[T]):
         paths = work.paths(number)
         # What is there already need not travel.
         self._is_here = bool(paths) and all((work.out / path).exists() for path in paths)
-        self._task: Any = None if self._is_here else self._submit()
+        self.task: Any = None if self._is_here else self._submit()
 
     def _submit(self) -> Any:
         files = read_files(self._work.out, self._work.paths(self._number))
@@ -174,7 +173,7 @@ class _Piece(Generic[T]):
         if self._is_here:
             return self._work(self._number)
         while True:
-            how, content = _end_of(self._task, self._work.out)
+            how, content = _end_of(self.task, self._work.out)
             if how == "done":
                 return content  # type: ignore[no-any-return]
             if how == "refused":
@@ -182,11 +181,15 @@ class _Piece(Generic[T]):
             self._ends[how] += 1
             if self._ends[how] >= ALLOWED[how]:
                 raise JobError(f"piece {self._number} {how} {self._ends[how]} times: {last_line(str(content))}")
-            self._task = self._submit()
+            self.task = self._submit()
 
-    def cancel(self) -> None:
-        if self._task is not None:
-            ray.cancel(self._task, force=True)
+
+def _cancel(tasks: list[Any]) -> None:
+    """Cancel pieces of work and wait until they have ended."""
+    for task in tasks:
+        ray.cancel(task)  # by force it would bring this process down, now and then, where the piece ends at that moment
+    if tasks:
+        ray.wait(tasks, num_returns=len(tasks), timeout=INTERRUPT_S)
 
 
 def _end_of(task: Any, out: Path) -> tuple[How, Any]:

@@ -363,7 +363,9 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_command_uses_a_cluster_elsewhere(elsewhere: str, tmp_path: Path) -> None:
+    """Ray's server for clients, when it is asked while it begins, may take a minute to find itself."""
     here, there = tmp_path / "here", tmp_path / "there"
     record(here, 100, progress=False)
     words = ["record", "--windows", "100", "--executor", "ray", "--address", elsewhere, "--out", str(there)]

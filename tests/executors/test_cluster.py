@@ -263,13 +263,9 @@ def test_an_evaluation_survives_a_node(nodes: Nodes, cluster: Executor, tmp_path
 
 DRIVER = """
 import sys
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from tests.executors.jobs import CountJob
-from tint_sumo.executors.cluster import LOOK_INTERVAL_S, _versions, ray_cluster
+from tint_sumo.executors.cluster import ray_cluster
 
 if __name__ == "__main__":
     address, out = sys.argv[1], Path(sys.argv[2])

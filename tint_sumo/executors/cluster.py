@@ -156,9 +156,8 @@ class _Piece(Generic[T]):
         self._number = number
         self._ends: Counter[str] = Counter()  # how often it was lost, and failed
         paths = work.paths(number)
-        # What is there already need not travel.
-        self._is_here = bool(paths) and all((work.out / path).exists() for path in paths)
-        self.task: Any = None if self._is_here else self._submit()
+        is_here = bool(paths) and all((work.out / path).exists() for path in paths)
+        self.task: Any = None if is_here else self._submit()  # what is there already need not travel
 
     def _submit(self) -> Any:
         files = read_files(self._work.out, self._work.paths(self._number))
@@ -170,7 +169,7 @@ class _Piece(Generic[T]):
         Raises:
             InputError, JobError: it was refused, or it failed or was lost again and again.
         """
-        if self._is_here:
+        if self.task is None:
             return self._work(self._number)
         while True:
             how, content = _end_of(self.task, self._work.out)

@@ -57,7 +57,11 @@ class Opened:
         self.page.goto(file.as_uri())
         self.page.wait_for_selector(".chart .main-svg", state="attached")
         self.page.wait_for_selector("#neighbours button")
-        self.page.wait_for_selector(".pane g.ego")
+        self.wait()
+
+    def wait(self) -> None:
+        """Wait until the player shows what was chosen."""
+        self.page.wait_for_selector("#theatre[aria-busy=false]")
 
     def _request(self, request: Any) -> None:
         if not request.url.startswith(("file:", "data:")):
@@ -94,6 +98,7 @@ def choose(opened: Opened, method: str, case: str, beside: str = "") -> None:
     opened.page.locator(".pane select").nth(0).select_option(method)
     opened.page.locator(".pane select").nth(1).select_option(beside)
     opened.page.locator("#case").select_option(case)
+    opened.wait()
 
 
 @pytest.mark.parametrize("viewport", [DESK, PHONE], ids=["desk", "phone"])
@@ -187,27 +192,29 @@ def test_every_button_and_key_moves_both_policies_through_the_same_case(opened: 
 
 def test_it_plays_only_when_told_and_at_the_chosen_speed(browser: Any, study: Path) -> None:
     opened = Opened(browser, study / "report.html", reduced_motion="reduce")
-    page = opened.page
-    page.wait_for_timeout(300)
+    page, clock = opened.page, opened.page.clock
+    clock.install(time=0)
+    clock.pause_at(1)  # from here on the page's time passes when the test says so
+    clock.run_for(1000)
     assert (opened.frame, opened.text("#play")) == (0, "Play")
     page.select_option("#speed", "4")
     page.focus("#stage")
     page.keyboard.press("Space")
     assert opened.text("#play") == "Pause" and opened.text("#player-status") == "Playing"
-    page.wait_for_timeout(700)
+    clock.run_for(700)
     page.keyboard.press("Space")
     assert opened.text("#play") == "Play" and opened.text("#player-status").startswith("Paused. ")
     stopped = opened.frame
-    assert 5 <= stopped <= 60
-    page.wait_for_timeout(200)
+    assert stopped in (27, 28)  # 0.7 s at four times the speed are 28 frames of 0.1 s; the last may be due
+    clock.run_for(1000)
     assert opened.frame == stopped
     page.click("#to-end")
     page.click("#back")
     page.click("#play")
-    page.wait_for_timeout(400)
+    clock.run_for(100)
     assert opened.text("#play") == "Play"  # at the end it stops
     page.click("#play")
-    assert opened.text("#play") == "Pause" and opened.frame < 30  # and begins again
+    assert (opened.frame, opened.text("#play")) == (0, "Pause")  # and begins again
     opened.context.close()
 
 

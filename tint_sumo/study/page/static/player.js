@@ -176,7 +176,11 @@ class Player {
     const options = Object.entries(policy.outcomes).map(([one, outcome]) => make("option", { value: one }, `${one}: ${outcome}`));
     byId("case").replaceChildren(...options);
     if (number in policy.outcomes) byId("case").value = number;
-    await Promise.all(this.panes.map((pane) => pane.load(byId("case").value)));
+    const loading = (this.loading = Promise.all(this.panes.map((pane) => pane.load(byId("case").value))));
+    byId("theatre").setAttribute("aria-busy", "true");
+    await loading;
+    if (this.loading !== loading) return; // something else was chosen meanwhile
+    byId("theatre").setAttribute("aria-busy", "false");
     byId("frame").max = this.frames - 1;
     this.show(0);
   }

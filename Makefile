@@ -1,11 +1,12 @@
-# make install | study | test | lint | coverage | docs | net | clean. Another build of torch: make install TORCH=torch
+# make install | study | test | test-long | lint | coverage | docs | net | clean
+# Another build of torch: make install TORCH=torch
 # Another Python, with an environment of its own beside .venv: make test PYTHON=python3.12
 PYTHON ?= python3
 VENV ?= .venv$(if $(filter-out python3,$(PYTHON)),-$(subst /,-,$(PYTHON:/%=%)))
 TORCH ?=
 BIN := $(VENV)/bin
 
-.PHONY: install study test lint coverage docs net clean
+.PHONY: install study test test-long lint coverage docs net clean
 
 install: $(VENV)/.installed
 
@@ -26,6 +27,9 @@ study: install
 
 test: lint
 	$(BIN)/pytest -n 2 --dist worksteal
+
+test-long: install
+	$(BIN)/pytest -m long
 
 lint: install
 	$(BIN)/ruff check .

@@ -352,7 +352,12 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
         port, client_port = one.getsockname()[1], other.getsockname()[1]
     options = [f"--port={port}", f"--ray-client-server-port={client_port}", "--num-cpus=1", "--include-dashboard=false"]
     ray_program = str(Path(sys.executable).with_name("ray"))
-    head = subprocess.Popen([ray_program, "start", "--head", "--block", *options], stdout=subprocess.DEVNULL)
+    command = [ray_program, "start", "--head", "--block", *options]
+    head = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert head.stdout is not None
+    for line in head.stdout:  # it tells what to do once it has started
+        if "Ray runtime started" in line:
+            break
     yield f"ray://127.0.0.1:{client_port}"
     head.terminate()
     head.wait(PATIENCE_S)
@@ -361,7 +366,6 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_command_uses_a_cluster_elsewhere(elsewhere: str, tmp_path: Path) -> None:
-    """Ray's server for clients, when it is asked while it begins, may take a minute to find itself."""
     here, there = tmp_path / "here", tmp_path / "there"
     record(here, 100, progress=False)
     words = ["record", "--windows", "100", "--executor", "ray", "--address", elsewhere, "--out", str(there)]

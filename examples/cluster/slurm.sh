@@ -57,18 +57,18 @@ fi
 echo "Dashboard: ssh -L 8265:127.0.0.1:$((port + 2)) $SLURMD_NODENAME, then http://localhost:8265"
 
 export RAY_ADDRESS=$address:$port # this is what --address auto finds
+# SLURM sends USR1 two minutes before the time is over. The job then goes to the end of the queue, and the same command
+# goes on there with what is in its --out. $! is the command, from the moment it has begun.
+requeue=false
+trap 'requeue=true; kill -TERM $! || true' USR1
+trap 'kill -TERM $! || true' TERM
 "$@" &
 command=$!
-# SLURM sends USR1 two minutes before the time is over. The job then goes to the end of the queue, and the same command
-# goes on there with what is in its --out.
-requeue=false
-trap 'requeue=true; kill -TERM $command' USR1
-trap 'kill -TERM $command' TERM
-status=0
-while kill -0 "$command" 2>/dev/null; do # a signal ends wait before the command has ended
-    status=0
-    wait "$command" || status=$?
+while kill -0 "$command" 2>/dev/null; do
+    wait "$command" || true # a signal ends this, too
 done
+status=0
+wait "$command" || status=$?
 if [ "$requeue" = true ]; then
     end_ray
     scontrol requeue "$SLURM_JOB_ID"

@@ -5,15 +5,14 @@ import pytest
 
 from tint_sumo import traits
 from tint_sumo.config import P_CONSERVATIVE, Idm, PpoSettings, TraitSettings, ends, is_share
-from tint_sumo.errors import InputError
-from tint_sumo.study.budgets import ALL_MIXES, BUDGETS, TRAIT_BUDGETS, Conditions, find_budget
+from tint_sumo.study.budgets import ALL_MIXES, BUDGETS, TRAIT_BUDGETS, Conditions
 from tint_sumo.study.methods import Learned, find_method
 from tint_sumo.study.training import SNAPSHOTS_PERCENT
 
 
 @pytest.mark.parametrize("name", BUDGETS)
 def test_every_budget_can_be_run(name: str) -> None:
-    budget = find_budget(name)
+    budget = BUDGETS[name]
     assert any(isinstance(find_method(method), Learned) for method in budget.methods)
     assert len(set(budget.methods)) == len(budget.methods)
     assert budget.ppo.n_minibatches <= budget.ppo.n_envs
@@ -24,7 +23,7 @@ def test_every_budget_can_be_run(name: str) -> None:
 
 @pytest.mark.parametrize("name", BUDGETS)
 def test_every_policy_is_tested_somewhere_after_a_part_of_the_training_that_is_kept(name: str) -> None:
-    budget = find_budget(name)
+    budget = BUDGETS[name]
     conditions = [one for trials in budget.trials for one in trials.conditions]
     assert len(set(conditions)) == len(conditions)
     assert {one.percent for one in conditions} <= {100, *SNAPSHOTS_PERCENT}
@@ -64,11 +63,6 @@ def test_the_full_budget_compares_all_methods_with_four_seeds_in_other_worlds_to
 def test_trait_budgets_are_networks_of_one_kind() -> None:
     assert set(TRAIT_BUDGETS) == set(BUDGETS)
     assert TRAIT_BUDGETS["quick"].hidden_size == TRAIT_BUDGETS["full"].hidden_size
-
-
-def test_unknown_budgets_are_answered_with_the_known_ones() -> None:
-    with pytest.raises(InputError, match="unknown budget 'huge'; choose one of: quick, full, paper"):
-        find_budget("huge")
 
 
 @pytest.mark.parametrize(

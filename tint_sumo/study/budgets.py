@@ -15,7 +15,7 @@ from tint_sumo.config import (
     require_positive,
     require_share,
 )
-from tint_sumo.errors import InputError, find_named
+from tint_sumo.errors import InputError
 
 ALL_MIXES: Share = (0.1, 0.9)  # P(conservative) is drawn from this range in every episode
 SNAPSHOTS_PERCENT = (25, 50)  # parts of a training after which the policy is kept, too
@@ -184,12 +184,3 @@ BUDGETS = {
 
 
 PPO_BUDGETS = {name: budget.ppo for name, budget in BUDGETS.items()}
-
-
-def find_budget(name: str) -> Budget:
-    """The budget called ``name``.
-
-    Raises:
-        InputError: there is none.
-    """
-    return find_named("budget", name, BUDGETS)

@@ -408,7 +408,7 @@ class Started:
         self.process = subprocess.Popen(command, stderr=theirs)
         os.close(theirs)
 
-    def interrupt_at(self, pattern: str) -> str:
+    def interrupt_at(self, pattern: str, sent: signal.Signals) -> str:
         """What it printed after the interruption."""
         seen, end = "", time.monotonic() + PATIENCE_S
         while not re.search(pattern, seen):
@@ -416,7 +416,7 @@ class Started:
             piece = self.read()
             assert piece, seen
             seen += piece
-        self.process.send_signal(signal.SIGINT)
+        self.process.send_signal(sent)
         rest = "".join(iter(self.read, ""))
         assert self.process.wait(PATIENCE_S) == 130
         return rest
@@ -427,7 +427,7 @@ class Started:
 
 def test_an_interrupted_training_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     argv = ("policy", "train", "--method", "oracle", "--steps", 30_000, "--out", tmp_path / "run")
-    printed = Started(*argv).interrupt_at(r"[1-9]\d*% ")
+    printed = Started(*argv).interrupt_at(r"[1-9]\d*% ", signal.SIGTERM)
     assert "Traceback" not in printed
     assert "tint-sumo: interrupted" in printed
     names = {path.name for path in (tmp_path / "run").glob("[!.]*")}
@@ -440,7 +440,7 @@ def test_an_interrupted_training_goes_on(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_an_interrupted_study_leaves_whole_files(tmp_path: Path) -> None:
     out = tmp_path / "study"
-    printed = Started("study", "run", "--out", out).interrupt_at(r"record: +[1-9]")
+    printed = Started("study", "run", "--out", out).interrupt_at(r"record: +[1-9]", signal.SIGINT)
     assert "Traceback" not in printed
     assert "the same command goes on from here" in printed
     assert not list(out.rglob("*.partial"))

@@ -32,7 +32,7 @@ from tint_sumo.configuration import (
     write_command,
 )
 from tint_sumo.errors import InputError, JobError
-from tint_sumo.processes import end_quickly
+from tint_sumo.processes import end_quickly, interrupt_on_sigterm
 from tint_sumo.provenance import Origin, made_by
 from tint_sumo.stores import working_folder
 from tint_sumo.structures import Where
@@ -800,8 +800,9 @@ class TintSumo:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code is 0, 1 if jobs failed, 2 after bad input, or 130 after an interruption."""
+    """Run one command; the exit code is 0, 1 if jobs failed, 2 after bad input, or 130 after Ctrl-C or SIGTERM."""
     end_quickly()
+    interrupt_on_sigterm()
     words = list(sys.argv[1:] if argv is None else argv)
     after_interrupt = Command.after_interrupt
     if words[:1] == ["--print-completion"] and words[1:] in ([shell] for shell in get_args(Shell)):

@@ -8,7 +8,8 @@ import threading
 import traceback
 from collections.abc import Callable
 from multiprocessing import connection, get_context, parent_process
-from typing import Any, Literal
+from types import FrameType
+from typing import Any, Literal, NoReturn
 
 from tint_sumo.errors import InputError
 
@@ -44,6 +45,19 @@ def _work(target: Callable[..., None], pipe: connection.Connection, *arguments: 
 def end_quickly() -> None:
     """Spare this process the last search for garbage among all objects of torch, which takes it most of a second."""
     atexit.register(gc.freeze)
+
+
+def interrupt_on_sigterm() -> None:
+    """Let SIGTERM, with which schedulers end a process, do what Ctrl-C does, so that work is saved.
+
+    Does nothing outside of the main thread, where Python does not allow it.
+    """
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _raise_interrupt)
+
+
+def _raise_interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
+    raise KeyboardInterrupt
 
 
 def told(work: Callable[[], Any]) -> Told:

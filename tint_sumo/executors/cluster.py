@@ -28,7 +28,7 @@ from tint_sumo.changes import Changes, file_states, read_files, write_files
 from tint_sumo.errors import InputError, JobError
 from tint_sumo.executors.jobs import ALLOWED, Begun, Ended, How, Job, News, Work, last_line, run_jobs
 from tint_sumo.executors.process import INTERRUPT_S, JobProcess, log_path
-from tint_sumo.processes import Told, told
+from tint_sumo.processes import Told, interrupt_on_sigterm, told
 from tint_sumo.progress import Progress
 from tint_sumo.provenance import PACKAGES
 
@@ -59,6 +59,7 @@ def ray_cluster(address: str = "auto", gpus_per_job: float = 0.0) -> Iterator["R
     if not 0.0 <= gpus_per_job < float("inf"):
         raise InputError(f"gpus_per_job must be 0 or more, not {gpus_per_job:g}")
     dashboard_url = _connect(address)
+    interrupt_on_sigterm()  # Ray has set an answer of its own
     try:
         yield RayCluster(gpus_per_job, dashboard_url)
     except RayError as error:

@@ -1,18 +1,16 @@
 """A job in a process of its own, which ends cleanly: when it is interrupted, with an error, or with its parent."""
 
 import os
-import signal
 import sys
 import time
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import FrameType
-from typing import NoReturn, TextIO
+from typing import TextIO
 
 from tint_sumo.errors import InputError
 from tint_sumo.executors.jobs import Ended, Job
-from tint_sumo.processes import start_worker, told
+from tint_sumo.processes import interrupt_on_sigterm, start_worker, told
 from tint_sumo.progress import Progress
 
 REPORT_INTERVAL_S = 0.2  # at most so often a job tells where it stands
@@ -69,7 +67,7 @@ class JobProcess:
 
 def _work(pipe: Connection, job: Job) -> None:
     """The worker process."""
-    signal.signal(signal.SIGTERM, _raise_interrupt)
+    interrupt_on_sigterm()
     log = job.out / log_path(job.name)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a", encoding="utf-8") as file:
@@ -95,7 +93,3 @@ def _print_into(file: TextIO) -> None:
         stream.flush()
         os.dup2(file.fileno(), stream.fileno())
         stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]
-
-
-def _raise_interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
-    raise KeyboardInterrupt

@@ -249,10 +249,10 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert [(row["method"], row["success"]) for row in printed["results"]] == [("ttc", 1.0)]
     assert [Path(file).name for file in printed["files"]] == ["results.csv", "results.md", "results.png", "report.html"]
     assert all(Path(file).is_file() for file in printed["files"])
-    assert main(["study", "report", "--out", str(tmp_path)]) == 0
+    assert main(["study", "report", "--out", tmp_path.as_uri()]) == 0
     text = capsys.readouterr().out
     assert "| time to collision |" in text
-    assert all(f"wrote {file}" in text for file in printed["files"])
+    assert all(f"wrote file://{file}" in text for file in printed["files"])
 
 
 # Bad input
@@ -302,6 +302,8 @@ def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         ("policy evaluate --model ttc --tau 0", "tau_s"),
         ("policy evaluate --model ttc --episodes 0", "episodes"),
         ("policy evaluate --model ttc --seed -1", "seed"),
+        ("policy train --method oracle --out s3://bucket/run", "--out of this command is a path on this machine"),
+        ("traits evaluate --data file:///data --model MODEL", "--data of this command is a path on this machine"),
         ("policy sweep --set n_epochs=2 --set gamma=0.9 --out OUT", "--set is given twice; give it once"),
         ("study run --workers 0 --out OUT", "workers"),
         ("study report --out NOWHERE", "no results in"),

@@ -633,14 +633,16 @@ class RunStudy(SpreadCommand):
 class ReportStudy(Command):
     """Make a study's tables, figures and page again; the page's episodes are recorded if they are not there."""
 
-    out: Path = Path("runs/quick")
-    """Folder of the study."""
+    out: FolderOrUrl = "runs/quick"
+    """Folder of the study, or its URL."""
 
     def run(self) -> Outcome:
         from tint_sumo.study.page import write_page
         from tint_sumo.study.report import write_report
 
-        return _report_outcome(write_page(write_report(self.out), self.out))
+        with working_folder(self.out) as out:
+            outcome = _report_outcome(write_page(write_report(out), out))
+        return outcome.naming(self.out, out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -649,8 +651,8 @@ class ShowLog(Command):
 
     name: Positional[str]
     """Name of the job, as "train oracle-P0.4-seed0"."""
-    out: Path = Path("runs/quick")
-    """Folder of the study, the comparison or the sweep."""
+    out: FolderOrUrl = "runs/quick"
+    """Folder of the study, the comparison or the sweep, or its URL."""
 
     def run(self) -> Outcome:
         from tint_sumo.executors.process import read_log
@@ -837,7 +839,7 @@ def parse(words: list[str]) -> Command:
     """The command that the words of a command line say, with what its configuration file says.
 
     Raises:
-        InputError: the file is not there, a value in it does not fit, or a flag comes twice.
+        InputError: the file is not there, a value in it does not fit, a flag comes twice, or a path is a URL.
     """
     _require_each_once(words)
     file = config_of(words)
@@ -852,6 +854,7 @@ def parse(words: list[str]) -> Command:
         parsed = tyro.cli(TintSumo, prog="tint-sumo", args=words, default=default, config=with_pairs)
     while not isinstance(parsed, Command):
         parsed = parsed.command
+    _require_paths(parsed)
     return parsed
 
 
@@ -861,6 +864,16 @@ def _require_each_once(words: Sequence[str]) -> None:
     for flag in flags:
         if flags.count(flag) > 1:
             raise InputError(f"{flag} is given twice; give it once, with all of its values behind it")
+
+
+def _require_paths(command: Command) -> None:
+    """Raise InputError if a URL is given where a path belongs: it would become a folder with a strange name."""
+    for name, value in vars(command).items():
+        if isinstance(value, Path) and value.parts and value.parts[0].endswith(":"):
+            raise InputError(
+                f"--{name.replace('_', '-')} of this command is a path on this machine, not a URL; only record, traits "
+                "study, study run and policy sweep write to URLs"
+            )
 
 
 def _completion_script(shell: str) -> str:

@@ -53,6 +53,11 @@ class Store:
 
     url: str
 
+    @classmethod
+    def at(cls, place: str | Path) -> "Store":
+        """The store at a URL, or a folder of this machine as a store."""
+        return cls(str(place) if is_url(place) else Path(place).resolve().as_uri())
+
     def files(self, under: str = "") -> dict[str, int]:
         """Sizes in bytes by path in the store of the files in its folder ``under``; empty where nothing is there."""
         from pyarrow.fs import FileSelector, FileType  # noqa: PLC0415

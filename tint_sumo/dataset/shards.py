@@ -87,7 +87,7 @@ def record_dataset(
         InputError: ``out`` holds another run, or the number of workers makes no sense.
     """
     executor = executor_of(workers)
-    store = Store(str(out) if is_url(out) else Path(out).resolve().as_uri())
+    store = Store.at(out)
     with (
         working_folder(out, without=(*TABLES, FCD)) as folder,
         claim_folder(folder, settings, with_versions=False),  # the manifest has them

@@ -12,6 +12,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.executors.jobs import Ended, Job
 from tint_sumo.processes import interrupt_on_sigterm, start_worker, told
 from tint_sumo.progress import Progress
+from tint_sumo.stores import Store
 
 REPORT_INTERVAL_S = 0.2  # at most so often a job tells where it stands
 INTERRUPT_S = 30.0  # more than enough to save a checkpoint
@@ -23,18 +24,18 @@ def log_path(name: str) -> str:
     return f"{LOGS}/{name.replace(' ', '-').replace('/', '-')}.log"
 
 
-def read_log(out: Path, name: str) -> str:
-    """What a job that worked in the folder ``out`` has printed, its error included if it failed.
+def read_log(out: str | Path, name: str) -> str:
+    """What a job that worked in ``out``, a folder or a URL, has printed, its error included if it failed.
 
     Raises:
         InputError: it has no log there.
     """
-    try:
-        return (out / log_path(name)).read_text(encoding="utf-8", errors="replace")
-    except FileNotFoundError:
-        names = sorted(file.stem for file in (out / LOGS).glob("*.log"))
-        known = f"known are {', '.join(names)}" if names else "no job has run there"
-        raise InputError(f"no log of a job {name} in {out}; {known}") from None
+    store, path = Store.at(out), log_path(name)
+    logs = store.files(LOGS)
+    if path not in logs:
+        known = f"known are {', '.join(Path(log).stem for log in logs)}" if logs else "no job has run there"
+        raise InputError(f"no log of a job {name} in {out}; {known}")
+    return store.read(path).decode("utf-8", errors="replace")
 
 
 class JobProcess:

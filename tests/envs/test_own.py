@@ -2,7 +2,7 @@
 
 import pickle
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any
 
 import gymnasium
@@ -11,6 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
+from tests.envs.test_workers import assert_infos_equal
 from tests.scenes.own_networks import OWN_NETWORKS, OwnNetwork
 from tint_sumo import SCENE_ENV_ID
 from tint_sumo.envs.sb3 import SceneVecEnv
@@ -145,6 +146,41 @@ def test_an_episode_goes_on_from_a_snapshot_as_it_did(name: str, own_network: Ma
             assert play(other, 1) == went_on
 
 
+@pytest.mark.parametrize("kind", ["one process", "workers", "scenes", "own network"])
+def test_the_episodes_of_a_vector_go_on_from_a_snapshot_as_they_did(kind: str, own_network: Make) -> None:
+    task: dict[str, Any] = {"position_noise_m": 0.1, "tracks": True, "time_limit_s": 12.0}
+    if kind == "own network":
+        task |= {"scene": [own_network("merge").scene(warm_up_s=5.0)] * 2}
+    task |= {"workers": {"workers": 2}, "scenes": {"scene": ["roundabout", T_INTERSECTION]}}.get(kind, {})
+    actions = np.random.default_rng(0).integers(3, size=(300, 4))
+    with closing(SceneVectorEnv(4 if kind != "own network" else 2, **task)) as vector:
+        count = vector.num_envs
+        vector.reset(seed=1)
+        for action in actions[:50]:
+            vector.step(action[:count])
+        vector.reset(options={"reset_mask": np.arange(count) == 0})
+        for action in actions[50:159]:
+            vector.step(action[:count])
+        here = vector.step(actions[159, :count])
+        snapshots = pickle.loads(pickle.dumps(vector.snapshot()))
+        went_on = [vector.step(action[:count]) for action in actions[160:]]
+    assert len({len(one.actions) for one in snapshots}) > 1, "the episodes began at different times"
+    with closing(SceneVectorEnv(count, **task)) as other:
+        observation, _ = other.restore(snapshots)
+        assert_infos_equal(observation, here[0])
+        goes_on = [other.step(action[:count]) for action in actions[160:]]
+    for before, after in zip(went_on, goes_on, strict=True):
+        for first, second in zip(before, after, strict=True):
+            assert_infos_equal(first, second)
+    assert any("final_obs" in one[4] for one in went_on)
+
+
 def test_there_is_nothing_to_come_back_to_before_the_first_reset() -> None:
     with made() as env, pytest.raises(InputError, match="reset the environment first"):
         env.snapshot()
+    with closing(SceneVectorEnv(2)) as vector:
+        with pytest.raises(InputError, match="reset the environments first"):
+            vector.snapshot()
+        vector.reset(seed=0)
+        with pytest.raises(InputError, match="1 snapshots do not fit 2 environments"):
+            vector.restore(vector.snapshot()[:1])

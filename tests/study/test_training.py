@@ -24,7 +24,7 @@ from tint_sumo.policy import ClassifierTraits, EncoderTraits, OracleTraits, Recu
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.storage import load_policy_network, read_policy_card
 from tint_sumo.progress import Progress, Report
-from tint_sumo.study.evaluation import CASE_SEED, evaluate
+from tint_sumo.study.evaluation import evaluate
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.training import CHECKPOINT_FILE, CURVE_FILE, ZIP_FILE, share_training, train_policy
 from tint_sumo.traits.storage import save
@@ -205,21 +205,32 @@ def test_a_run_may_be_interrupted_again_and_again(tmp_path: Path, brief: PpoSett
     assert pd.read_csv(tmp_path / CURVE_FILE)["decisions"].tolist() == [64, 128, 192, 256]
 
 
-def test_a_resumed_run_meets_new_episodes(tmp_path: Path, tiny: PpoSettings, monkeypatch: pytest.MonkeyPatch) -> None:
-    seeds: list[int] = []
-    original = RecurrentPPO.learn
+@pytest.mark.parametrize("method", ["oracle", "vae", "streaming_critic"])
+def test_an_interrupted_run_ends_with_the_very_same_policy(method: str, tmp_path: Path, tiny: PpoSettings) -> None:
+    """Episodes of 10 s are 25 decisions, and end within rollouts of 16; traits are inferred after 5 decisions."""
+    settings = replace(tiny, time_limit_s=10.0)
+    at_a_stretch, resumed = tmp_path / "at_a_stretch", tmp_path / "resumed"
+    train_policy(method, (0.1, 0.9), 512, 0, at_a_stretch, settings=settings)
+    for steps in (128, 320):
+        with pytest.raises(KeyboardInterrupt):
+            train_policy(method, (0.1, 0.9), 512, 0, resumed, settings=settings, report=interrupt_at(steps))
+        torch.manual_seed(steps)  # another process has other random numbers
+    train_policy(method, (0.1, 0.9), 512, 0, resumed, settings=settings)
+    assert_same_training(resumed, at_a_stretch)
 
-    def learn(model: RecurrentPPO, *args: Any, **kwargs: Any) -> RecurrentPPO:
-        assert model.env is not None
-        seeds.extend(model.env.unwrapped._seeds)
-        return original(model, *args, **kwargs)
 
-    monkeypatch.setattr(RecurrentPPO, "learn", learn)
+def assert_same_training(out: Path, other: Path) -> None:
+    """To the last bit."""
+    for name in (*SNAPSHOTS, "policy.json", "policy.safetensors", CURVE_FILE):
+        assert (out / name).read_bytes() == (other / name).read_bytes(), name
+
+
+def test_a_checkpoint_of_an_earlier_version_is_named(tmp_path: Path, tiny: PpoSettings) -> None:
     with pytest.raises(KeyboardInterrupt):
-        train_policy("oracle", 0.4, 192, 0, tmp_path / "run", settings=tiny, report=interrupt_at(128))
-    train_policy("oracle", 0.4, 192, 0, tmp_path / "run", settings=tiny)
-    assert len(set(seeds)) == 8  # 4 environments, twice
-    assert max(seeds) < CASE_SEED
+        train_policy("oracle", 0.4, 128, 0, tmp_path, settings=tiny, report=interrupt_at(64))
+    RecurrentPPO.load(tmp_path / CHECKPOINT_FILE).save(tmp_path / CHECKPOINT_FILE)
+    with pytest.raises(InputError, match=r"checkpoint\.zip is of an earlier version; remove it to begin"):
+        train_policy("oracle", 0.4, 128, 0, tmp_path, settings=tiny)
 
 
 @pytest.mark.slow
@@ -245,7 +256,8 @@ def test_a_killed_run_leaves_whole_files_and_goes_on(tmp_path: Path) -> None:
     assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
     assert not list(out.rglob("*.partial"))
     assert pd.read_csv(out / CURVE_FILE)["decisions"].tolist() == list(range(64, runs.STEPS + 1, 64))
-    assert all(load_policy(out / name) for name in ("policy-25", "policy-50", "policy"))
+    train_policy(runs.METHOD, 0.4, runs.STEPS, runs.SEED, tmp_path / "at_a_stretch", settings=runs.SETTINGS)
+    assert_same_training(out, tmp_path / "at_a_stretch")
 
 
 def test_a_damaged_checkpoint_is_named(tmp_path: Path, tiny: PpoSettings) -> None:

@@ -1,5 +1,7 @@
 """Environments in a batch, whose episodes follow one another."""
 
+import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -27,6 +29,14 @@ class Ended:
         return outcome_name(self.row["outcome"])
 
 
+@dataclass(frozen=True)
+class Snapshot:
+    """How an episode has come to where it is: it follows from its seed and the actions so far."""
+
+    began: dict[str, Any]  # state of the environment's generator that the seed was drawn from
+    actions: tuple[int, ...]
+
+
 class Batch(Protocol):
     """Environments that step together."""
 
@@ -41,6 +51,12 @@ class Batch(Protocol):
     def park(self, mask: NDArray[np.bool_]) -> None:
         """Empty the environments where the mask (N,) is true: they cost next to nothing until their next reset."""
 
+    def snapshot(self) -> list[Snapshot]:
+        """Where each environment is; all have been reset, and none is parked."""
+
+    def restore(self, snapshots: Sequence[Snapshot]) -> None:
+        """Bring each environment to where one was."""
+
     def render(self) -> list[NDArray[np.uint8]]: ...
 
     def close(self) -> None: ...
@@ -53,6 +69,10 @@ class LocalBatch:
         self.episodes = Episodes(num_envs, settings, rows)
         self.rows = self.episodes.rows
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._began: list[dict[str, Any]] = [{}] * num_envs  # states of the generators when the episodes began
+        scene = settings.played
+        longest = math.ceil(scene.time_limit_s / scene.step_s) + 1
+        self._actions: deque[NDArray[np.integer]] = deque(maxlen=longest)  # of the last steps, (N,) each
 
     def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> None:
         for index in np.flatnonzero(mask).tolist():
@@ -63,10 +83,12 @@ class LocalBatch:
         if rng is None or seed is not None:
             rng, _ = seeding.np_random(seed)
             self._rngs[index] = rng
+        self._began[index] = dict(rng.bit_generator.state)
         self.episodes.begin(index, rng)
 
     @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> list[Ended]:
+        self._actions.append(actions.astype(np.int8))
         if not self.episodes.step(actions):
             return []
         ended = [self._ended(index) for index in np.flatnonzero(self.rows["outcome"]).tolist()]
@@ -77,6 +99,28 @@ class LocalBatch:
     def park(self, mask: NDArray[np.bool_]) -> None:
         for index in np.flatnonzero(mask).tolist():
             self.episodes.simulation.clear(index)
+
+    def snapshot(self) -> list[Snapshot]:
+        taken = np.array(self._actions, np.int8).reshape(-1, len(self._began))
+        first = len(taken) - self.episodes.steps  # of the present episodes
+        return [
+            Snapshot(began, tuple(taken[first[index] :, index].tolist())) for index, began in enumerate(self._began)
+        ]
+
+    def restore(self, snapshots: Sequence[Snapshot]) -> None:
+        """All episodes are simulated once more, and begin such that they arrive together."""
+        self.park(np.ones(len(snapshots), bool))
+        for left in range(max(len(one.actions) for one in snapshots), -1, -1):
+            for index, one in enumerate(snapshots):
+                if len(one.actions) == left:
+                    rng, _ = seeding.np_random(0)
+                    rng.bit_generator.state = one.began
+                    self._rngs[index] = rng
+                    self._begin(index)
+            if left:
+                actions = [one.actions[-left] if left <= len(one.actions) else 0 for one in snapshots]
+                self._actions.append(np.array(actions, np.int8))
+                self.episodes.step(self._actions[-1])
 
     def _ended(self, index: int) -> Ended:
         return Ended(index, self.rows[index].copy(), self.episodes.collision_info(index))

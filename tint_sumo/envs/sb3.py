@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.timing import StepPart, does
 
@@ -62,6 +63,16 @@ class SceneVecEnv(VecEnv):
             if final["_collision"][index]:
                 listed[index]["collision"] = final["collision"][index]
         return observation, reward.astype(np.float32), done, listed
+
+    def snapshot(self) -> list[Snapshot]:
+        """As in ``SceneVectorEnv``."""
+        return self.env.snapshot()
+
+    def restore(self, snapshots: Sequence[Snapshot]) -> VecEnvObs:
+        """As in ``SceneVectorEnv``; the observation there."""
+        observation, infos = self.env.restore(snapshots)
+        self.slots = {key: infos[key] for key in self.env.slot_infos}
+        return observation
 
     def close(self) -> None:
         self.env.close()

@@ -1,12 +1,12 @@
 """The single environment."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_actions
 from tint_sumo.envs.rendering import RENDER_FPS, render_scene, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, outcome_name
@@ -15,14 +15,6 @@ from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
 from tint_sumo.simulation.own import OwnSimulation
 from tint_sumo.simulation.simulation import Simulation
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """How an episode has come to where it is: it follows from its seed and the actions so far."""
-
-    began: dict[str, Any]  # state of the environment's generator that the seed was drawn from
-    actions: tuple[int, ...]
 
 
 class SceneEnv(gymnasium.Env[Any, Any]):

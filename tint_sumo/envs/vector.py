@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from tint_sumo.envs.batch import Batch, Ended, LocalBatch
+from tint_sumo.envs.batch import Batch, Ended, LocalBatch, Snapshot
 from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space, require_actions
 from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, copied
@@ -72,6 +72,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.batch: Batch = LocalBatch(num_envs, settings) if len(scenes) == 1 else WorkerBatch(num_envs, all_settings)
+        self._has_begun = False
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -87,6 +88,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise InputError(f"{len(seeds)} seeds do not fit {self.num_envs} environments; give one number or as many")
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
         self.batch.reset(seeds, mask)
+        self._has_begun = True
         rows = copied(self.batch.rows)
         return _observation(rows), self._infos(rows)
 
@@ -102,6 +104,31 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if ended:
             infos |= self._final(infos, ended)
         return _observation(rows), rows["reward"], rows["terminated"], rows["truncated"], infos
+
+    def snapshot(self) -> list[Snapshot]:
+        """What ``restore`` needs to come back to where the episodes are now, as in ``SceneEnv``; it can be pickled.
+
+        Raises:
+            InputError: no episodes have begun.
+        """
+        if not self._has_begun:
+            raise InputError("there are no episodes to come back to; reset the environments first")
+        return self.batch.snapshot()
+
+    def restore(self, snapshots: Sequence[Snapshot]) -> tuple[Observation, dict[str, Any]]:
+        """Go back, or to the episodes of another vector with the same arguments; the observation and infos there.
+
+        It takes as long as the longest episode so far.
+
+        Raises:
+            InputError: there are not as many snapshots as environments.
+        """
+        if len(snapshots) != self.num_envs:
+            raise InputError(f"{len(snapshots)} snapshots do not fit {self.num_envs} environments; give as many")
+        self.batch.restore(snapshots)
+        self._has_begun = True
+        rows = copied(self.batch.rows)
+        return _observation(rows), self._infos(rows)
 
     def _infos(self, rows: dict[str, NDArray[Any]]) -> dict[str, Any]:
         outcome = np.full(self.num_envs, "")  # an episode that ended has been followed by the next

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.envs.batch import Ended, LocalBatch
+from tint_sumo.envs.batch import Ended, LocalBatch, Snapshot
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import Rows, row_type
 from tint_sumo.processes import SPAWN, answer, start_worker, told
@@ -70,6 +70,12 @@ class WorkerBatch:
 
     def park(self, mask: NDArray[np.bool_]) -> None:
         self._ask("park", lambda share: (mask[share],))
+
+    def snapshot(self) -> list[Snapshot]:
+        return [one for share in self._ask("snapshot", lambda _: ()) for one in share]
+
+    def restore(self, snapshots: Sequence[Snapshot]) -> None:
+        self._ask("restore", lambda share: (snapshots[share],))
 
     def render(self) -> list[NDArray[np.uint8]]:
         return [image for images in self._ask("render", lambda _: ()) for image in images]

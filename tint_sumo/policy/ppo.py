@@ -130,7 +130,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
             )
         self.rollout_buffer_class = buffer_class(self.observation_space)
         super()._setup_model()
-        self._last_states = self.policy.initial_states(self.n_envs)
+        self.hidden_states = self.policy.initial_states(self.n_envs)
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
@@ -139,14 +139,14 @@ class RecurrentPPO(OnPolicyAlgorithm):
         assert isinstance(rollout_buffer, SequenceBuffer)
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
-        rollout_buffer.states = self._last_states
+        rollout_buffer.states = self.hidden_states
         callback.on_rollout_start()
         for _ in range(n_rollout_steps):
             obs, starts = self._last_obs, self._last_episode_starts
             assert obs is not None and starts is not None, "learn resets the environment before it collects"
             with torch.no_grad():
                 action_tensor, values, log_probs, states = self.policy(
-                    obs_as_tensor(obs, self.device), self._last_states, self._on_device(starts)
+                    obs_as_tensor(obs, self.device), self.hidden_states, self._on_device(starts)
                 )
             actions = action_tensor.cpu().numpy()
             new_obs, rewards, dones, infos = env.step(self._within_bounds(actions))
@@ -158,11 +158,11 @@ class RecurrentPPO(OnPolicyAlgorithm):
             rewards = rewards + self.gamma * self._values_at_time_limit(dones, infos, states)
             rollout_buffer.add(obs, actions, rewards, starts, values, log_probs)  # type: ignore[arg-type]
             self._last_obs = new_obs  # type: ignore[assignment]
-            self._last_episode_starts, self._last_states = dones, states
+            self._last_episode_starts, self.hidden_states = dones, states
         with torch.no_grad():
             last_values = self.policy.predict_values(
                 obs_as_tensor(new_obs, self.device),  # type: ignore[arg-type]
-                self._last_states,
+                self.hidden_states,
                 self._on_device(dones),
             )
         rollout_buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
@@ -282,7 +282,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
             raise InputError(f"policy: {path} does not fit or is damaged ({reason}); train it anew") from error
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_last_states"]
+        return [*super()._excluded_save_params(), "hidden_states"]
 
 
 def _stacked(observations: list[Any]) -> Any:

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -43,6 +43,10 @@ class TraitSource(ABC):
     def attach(self, num_envs: int, max_vehicles: int) -> None:
         """Get ready for ``num_envs`` environments of so many slots."""
         self.traits = np.zeros((num_envs, max_vehicles, self.size), np.float32)
+
+    def memory(self) -> dict[str, Any]:
+        """The arrays and tensors that hold what it knows of the present episodes, by name."""
+        return {"traits": self.traits}
 
     @abstractmethod
     def begin(self, frame: Frame) -> None:
@@ -123,6 +127,10 @@ class EncoderTraits(TraitSource):
         self._steps = np.zeros(num_envs, np.int64)
         self._present = np.zeros(shape, bool)
         self._position_m, self._gap_m = np.zeros(shape), np.zeros(shape)
+
+    def memory(self) -> dict[str, Any]:
+        seen = {"present": self._present, "position_m": self._position_m, "gap_m": self._gap_m}
+        return {**super().memory(), "steps": self._steps, **seen}
 
     def begin(self, frame: Frame) -> None:
         self._steps[frame.done] = 0
@@ -205,6 +213,9 @@ class StreamingTraits(TraitSource):
         super().attach(num_envs, max_vehicles)
         self._tracks = np.arange(num_envs * max_vehicles).reshape(num_envs, max_vehicles)
         self._stream = TrackStream(self.model, self._tracks.size)
+
+    def memory(self) -> dict[str, Any]:
+        return {**super().memory(), **self._stream.memory()}
 
     def begin(self, frame: Frame) -> None:
         envs = np.flatnonzero(frame.done)

@@ -1,9 +1,13 @@
 """The environments a policy is trained and tested in: a scene, traits in its observations, decisions now and then."""
 
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 
+from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy.action_repeat import ActionRepeat
 from tint_sumo.policy.trait_observation import TRUE_TRAITS, TraitObservation
@@ -38,3 +42,44 @@ def policy_venv(
     if critic_sees_true_traits:
         venv = TraitObservation(venv, OracleTraits(), TRUE_TRAITS)
     return ActionRepeat(VecMonitor(venv) if monitored else venv, action_repeat)
+
+
+@dataclass(frozen=True)
+class VenvSnapshot:
+    """Where environments made by ``policy_venv`` are, and what is remembered around them; it can be pickled."""
+
+    episodes: list[Snapshot]
+    memories: list[dict[str, Any]]  # of each wrapper, from the outermost inwards
+
+
+def snapshot(venv: VecEnv) -> VenvSnapshot:
+    """What ``restore`` needs to come back to where the environments of ``policy_venv`` are, between two decisions."""
+    *wrappers, base = _layers(venv)
+    assert isinstance(base, SceneVecEnv)
+    return VenvSnapshot(base.snapshot(), copy.deepcopy([_memory(wrapper) for wrapper in wrappers]))
+
+
+def restore(venv: VecEnv, there: VenvSnapshot) -> None:
+    """Go to where environments were that were made with the same arguments; they then go on as those did."""
+    *wrappers, base = _layers(venv)
+    assert isinstance(base, SceneVecEnv)
+    base.restore(there.episodes)
+    for wrapper, saved in zip(wrappers, there.memories, strict=True):
+        for name, array in _memory(wrapper).items():
+            array[...] = saved[name]
+
+
+def _layers(venv: VecEnv) -> Iterator[VecEnv]:
+    while isinstance(venv, VecEnvWrapper):
+        yield venv
+        venv = venv.venv
+    yield venv
+
+
+def _memory(wrapper: VecEnv) -> dict[str, Any]:
+    """The arrays and tensors in which a wrapper holds what it knows of the present episodes, by name."""
+    if isinstance(wrapper, TraitObservation):
+        return wrapper.source.memory()
+    if isinstance(wrapper, VecMonitor):
+        return {"returns": wrapper.episode_returns, "lengths": wrapper.episode_lengths}
+    return {}

@@ -29,6 +29,7 @@ from tint_sumo.progress import Progress, Report, silent
 from tint_sumo.provenance import versions
 from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnScene, described, find_scene
 from tint_sumo.study.budgets import SNAPSHOTS_PERCENT
+from tint_sumo.study.checkpoint import load_checkpoint, make_checkpoint
 from tint_sumo.study.evaluation import CASE_SEED, require_seed
 from tint_sumo.study.methods import Learned, find_learned
 from tint_sumo.training_log import log_film, open_log
@@ -217,16 +218,17 @@ def _learn(
 ) -> RecurrentPPO:
     """Train from the checkpoint, if there is one, to ``steps``."""
     checkpoint = out / CHECKPOINT_FILE
-    model = RecurrentPPO.load(checkpoint, env=venv) if checkpoint.exists() else new_model(venv, seed, settings)
+    if checkpoint.exists():
+        model, recent = load_checkpoint(checkpoint, venv)
+    else:
+        model, recent = new_model(venv, seed, settings), ()
+        venv.seed(_training_seed(seed))
     done = model.num_timesteps
     told = {key: card[key] for key in ("method", "p_conservative", "scene", "seed", "steps", "settings")}
     model.set_logger(open_log(out, told, [f"rollout/{outcome}" for outcome in OUTCOMES], done))
     if done < steps:
-        if done:  # loading has set the random streams back to their beginning
-            model.set_random_seed(_training_seed(seed, done))
-        venv.seed(_training_seed(seed, done))
         report(Progress(done, steps, "step"))
-        watch = _Watch(out, steps, card, film, report)
+        watch = _Watch(out, steps, card, film, report, recent)
         try:
             model.learn(steps - done, callback=watch, reset_num_timesteps=False)
         except KeyboardInterrupt:
@@ -261,9 +263,9 @@ def new_model(venv: VecEnv, seed: int, settings: PpoSettings) -> RecurrentPPO:
     )
 
 
-def _training_seed(seed: int, done: int) -> int:
-    """Seed of the first environment of a run that starts or goes on after ``done`` steps; below every case's seed."""
-    return int(np.random.SeedSequence((seed, done)).generate_state(1)[0]) % (CASE_SEED // 2)
+def _training_seed(seed: int) -> int:
+    """Seed of the first environment; below every case's seed."""
+    return int(np.random.SeedSequence((seed, 0)).generate_state(1)[0]) % (CASE_SEED // 2)
 
 
 class _Watch(BaseCallback):
@@ -279,6 +281,7 @@ class _Watch(BaseCallback):
         card: Mapping[str, Any],
         film: FilmMaker | None,
         report: Report,
+        recent: tuple[str, ...],
     ) -> None:
         super().__init__()
         self._out = out
@@ -286,7 +289,7 @@ class _Watch(BaseCallback):
         self._card = card
         self._film = film
         self._report = report
-        self._recent: deque[str] = deque(maxlen=RECENT_EPISODES)
+        self._recent: deque[str] = deque(recent, maxlen=RECENT_EPISODES)
         self._saved_at = time.monotonic()
         self._state = b""
         self._curve: list[list[str]] = []
@@ -297,9 +300,8 @@ class _Watch(BaseCallback):
         self._curve = [row for row in rows if int(row[0]) <= self.num_timesteps]
 
     def _on_rollout_start(self) -> None:
-        state = io.BytesIO()
-        self.model.save(state)
-        self._state = state.getvalue()
+        assert isinstance(self.model, RecurrentPPO)
+        self._state = make_checkpoint(self.model, self._recent)
         if time.monotonic() - self._saved_at >= CHECKPOINT_INTERVAL_S:
             self.write_checkpoint()
             self._saved_at = time.monotonic()

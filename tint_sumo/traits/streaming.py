@@ -1,5 +1,7 @@
 """Traits of many tracks at once, brought up to date with every step instead of read from whole windows."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -37,6 +39,16 @@ class TrackStream:
         self._window_steps[index] = 0
         self._complete[:, index] = 0.0
         self.steps[tracks] = 0.0
+
+    def memory(self) -> dict[str, Any]:
+        """The arrays and tensors that hold what it has seen, by name."""
+        return {
+            "hidden": self._hidden,
+            "window_steps": self._window_steps,
+            "along_m": self._along_m,
+            "complete": self._complete,
+            "steps": self.steps,
+        }
 
     @torch.no_grad()
     def advance(

@@ -71,6 +71,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
     policy: GruPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"GruPolicy": GruPolicy}
     rollout_buffer: SequenceBuffer
+    hidden_states: Tensor  # of the policy before the next step, (n_envs, hidden_size)
 
     def __init__(
         self,

@@ -49,9 +49,10 @@ class Nodes:
     """A head node that does no jobs, and nodes of one CPU each that do."""
 
     def __init__(self) -> None:
-        # A dead node is noticed within a second or two, not within half a minute.
-        fast = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 2}
-        head = {"num_cpus": 0, "include_dashboard": False, "_system_config": fast, **self._small()}
+        # A dead node is noticed within a second or two, not within half a minute. Jobs do not give way to other work.
+        health = {"initial_delay_ms": 0, "period_ms": 500, "failure_threshold": 2}
+        system = {"worker_niceness": 0} | {f"health_check_{name}": value for name, value in health.items()}
+        head = {"num_cpus": 0, "include_dashboard": False, "_system_config": system, **self._small()}
         self._cluster = Cluster(initialize_head=True, head_node_args=head)
         self.workers: list[Any] = []
         self.restore()

@@ -24,7 +24,7 @@ from tint_sumo.policy import ClassifierTraits, EncoderTraits, OracleTraits, Recu
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.storage import load_policy_network, read_policy_card
 from tint_sumo.progress import Progress, Report
-from tint_sumo.study.evaluation import evaluate
+from tint_sumo.study.evaluation import CASE_SEED, evaluate
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.training import CHECKPOINT_FILE, CURVE_FILE, ZIP_FILE, share_training, train_policy
 from tint_sumo.traits.storage import save
@@ -219,6 +219,21 @@ def test_an_interrupted_run_ends_with_the_very_same_policy(method: str, tmp_path
     assert_same_training(resumed, at_a_stretch)
 
 
+def test_a_run_meets_no_case_of_the_tests(tmp_path: Path, tiny: PpoSettings, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+    original = RecurrentPPO.learn
+
+    def learn(model: RecurrentPPO, *args: Any, **kwargs: Any) -> RecurrentPPO:
+        assert model.env is not None
+        seeds.extend(model.env.unwrapped._seeds)
+        return original(model, *args, **kwargs)
+
+    monkeypatch.setattr(RecurrentPPO, "learn", learn)
+    train_policy("oracle", 0.4, 64, 0, tmp_path / "run", settings=tiny)
+    assert len(set(seeds)) == 4  # environments
+    assert max(seeds) < CASE_SEED
+
+
 def assert_same_training(out: Path, other: Path) -> None:
     """To the last bit."""
     for name in (*SNAPSHOTS, "policy.json", "policy.safetensors", CURVE_FILE):
@@ -256,6 +271,7 @@ def test_a_killed_run_leaves_whole_files_and_goes_on(tmp_path: Path) -> None:
     assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
     assert not list(out.rglob("*.partial"))
     assert pd.read_csv(out / CURVE_FILE)["decisions"].tolist() == list(range(64, runs.STEPS + 1, 64))
+    assert all(load_policy(out / name) for name in ("policy-25", "policy-50", "policy"))
     train_policy(runs.METHOD, 0.4, runs.STEPS, runs.SEED, tmp_path / "at_a_stretch", settings=runs.SETTINGS)
     assert_same_training(out, tmp_path / "at_a_stretch")
 

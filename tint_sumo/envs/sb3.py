@@ -38,7 +38,7 @@ class SceneVecEnv(VecEnv):
         observation, infos = self.env.reset(seed=seeds)
         self._reset_seeds()
         self._reset_options()
-        self.slots = {key: infos[key] for key in self.env.slot_infos}
+        self._keep_slots(infos)
         self.reset_infos = [{"traits": traits} for traits in infos["traits"]]
         return observation
 
@@ -49,7 +49,7 @@ class SceneVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         observation, reward, terminated, truncated, infos = self.env.step(self._actions)
         done = terminated | truncated
-        self.slots = {key: infos[key] for key in self.env.slot_infos}
+        self._keep_slots(infos)
         listed: list[dict[str, Any]] = [{"traits": traits, "outcome": ""} for traits in infos["traits"]]
         for index in np.flatnonzero(done).tolist():
             final = infos["final_info"]
@@ -71,8 +71,11 @@ class SceneVecEnv(VecEnv):
     def restore(self, snapshots: Sequence[Snapshot]) -> VecEnvObs:
         """As in ``SceneVectorEnv``; the observation there."""
         observation, infos = self.env.restore(snapshots)
-        self.slots = {key: infos[key] for key in self.env.slot_infos}
+        self._keep_slots(infos)
         return observation
+
+    def _keep_slots(self, infos: dict[str, Any]) -> None:
+        self.slots = {key: infos[key] for key in self.env.slot_infos}
 
     def close(self) -> None:
         self.env.close()

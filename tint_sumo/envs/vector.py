@@ -89,8 +89,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
         self.batch.reset(seeds, mask)
         self._has_begun = True
-        rows = copied(self.batch.rows)
-        return _observation(rows), self._infos(rows)
+        return self._shown()
 
     def step(
         self, actions: NDArray[np.int64]
@@ -127,6 +126,10 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise InputError(f"{len(snapshots)} snapshots do not fit {self.num_envs} environments; give as many")
         self.batch.restore(snapshots)
         self._has_begun = True
+        return self._shown()
+
+    def _shown(self) -> tuple[Observation, dict[str, Any]]:
+        """The observation and infos where the environments are."""
         rows = copied(self.batch.rows)
         return _observation(rows), self._infos(rows)
 

@@ -265,7 +265,8 @@ def new_model(venv: VecEnv, seed: int, settings: PpoSettings) -> RecurrentPPO:
 
 def _training_seed(seed: int) -> int:
     """Seed of the first environment; below every case's seed."""
-    return int(np.random.SeedSequence((seed, 0)).generate_state(1)[0]) % (CASE_SEED // 2)
+    sequence = np.random.SeedSequence((seed, 0))  # of two numbers, as when the shipped policies were trained
+    return int(sequence.generate_state(1)[0]) % (CASE_SEED // 2)
 
 
 class _Watch(BaseCallback):

@@ -43,6 +43,15 @@ def require_at_least(owner: object, lowest: float, *names: str) -> None:
             raise InputError(f"{name} must be at least {lowest:g}, not {value}")
 
 
+def set_floats(owner: object, *names: str) -> None:
+    """Make floats of the numbers in these fields of a frozen dataclass, so that 1 and 1.0 are one value; None stays."""
+    for name in names:
+        value = getattr(owner, name)
+        if value is not None:
+            number = tuple(map(float, value)) if isinstance(value, Sequence) else float(value)
+            object.__setattr__(owner, name, number)
+
+
 def require_fraction(owner: object, *names: str) -> None:
     """Raise InputError unless these fields lie in [0, 1]."""
     for name in names:

@@ -56,7 +56,8 @@ def test_the_full_budget_compares_all_methods_with_four_seeds_in_other_worlds_to
     assert {method.encoder for method in trained} - {None} == set(traits.TRAIT_METHODS)
     conditions = {one for trials in full.trials for one in trials.conditions}
     assert {one.position_noise_m for one in conditions} > {0.0, 0.1}
-    assert min(one.tau_s for one in conditions) < Idm.tau_s < max(one.tau_s for one in conditions)
+    headways_s = [one.tau_s for one in conditions if one.tau_s is not None]
+    assert min(headways_s) < Idm.tau_s < max(headways_s)
     assert {one.percent for one in conditions} == {25, 50, 100}
 
 
@@ -72,9 +73,26 @@ def test_trait_budgets_are_networks_of_one_kind() -> None:
         (Conditions(ALL_MIXES), "as trained"),
         (Conditions(0.4, position_noise_m=0.05), "noise 0.05 m"),
         (Conditions(0.4, tau_s=1.5), "tau 1.5 s"),
+        (Conditions(0.4, tau_s=Idm.tau_s), "tau 1 s"),
         (Conditions(0.4, percent=25), "25 % of training"),
         (Conditions(0.4, 0.1, 0.7, 50), "noise 0.1 m, tau 0.7 s, 50 % of training"),
     ],
 )
 def test_conditions_are_called_by_what_differs_from_the_training(conditions: Conditions, label: str) -> None:
     assert conditions.label == label
+
+
+def test_a_headway_that_is_not_given_is_the_scene_s() -> None:
+    own, given = Conditions(0.4), Conditions(0.4, tau_s=Idm.tau_s)
+    assert "tau_s" not in own.world
+    assert given.world["tau_s"] == Idm.tau_s
+    assert own.resolved(1.5).tau_s == 1.5
+    assert given.resolved(1.5) == given.relative_to(1.5) == given
+    assert given.relative_to(Idm.tau_s) == own.relative_to(Idm.tau_s) == own
+
+
+def test_conditions_are_the_same_with_whole_numbers_as_with_floats() -> None:
+    whole, floats = Conditions(1, 2, 3), Conditions(1.0, 2.0, 3.0)
+    assert whole == floats and repr(whole) == repr(floats)
+    assert Conditions(1).is_single_mix and not Conditions([0, 1]).is_single_mix
+    assert repr(Conditions([0, 1])) == repr(Conditions((0.0, 1.0)))

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tint_sumo.config import PpoSettings, TraitSettings
+from tint_sumo.config import Idm, PpoSettings, TraitSettings
 from tint_sumo.errors import InputError
+from tint_sumo.scenes import find_scene
 from tint_sumo.study import budgets, grid, policy_jobs
 from tint_sumo.study.budgets import ALL_MIXES, BUDGETS, Budget, Conditions
 from tint_sumo.study.ceiling_job import CeilingJob
@@ -48,6 +49,16 @@ def finished(budget: Budget, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def times(out: Path) -> dict[str, int]:
     return {str(path.relative_to(out)): path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+
+
+def test_a_headway_that_is_the_scene_s_is_planned_like_one_that_is_not_given(tmp_path: Path) -> None:
+    given = tuple(budgets.Trials((Conditions(0.4, tau_s=tau_s),), 1) for tau_s in (1.0, 1.5))
+    scene = find_scene("four_way")
+    slow = replace(scene, name="slow", population=replace(scene.population, idm=Idm(tau_s=1.5)))
+    jobs = plan(replace(BUDGETS["quick"], trials=given), tmp_path, slow)
+    planned = tuple(budgets.Trials((one,), 1) for one in (Conditions(0.4, tau_s=1.0), Conditions(0.4)))
+    tests = [job for job in jobs if isinstance(job, policy_jobs.EvaluateJob | CeilingJob)]
+    assert tests and all(job.trials == planned for job in tests)
 
 
 @pytest.mark.slow

@@ -6,10 +6,11 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from tint_sumo.config import PpoSettings, Share
+from tint_sumo.config import Idm, PpoSettings, Share
 from tint_sumo.errors import InputError
 from tint_sumo.files import write_text
 from tint_sumo.progress import Progress, silent
+from tint_sumo.scenes import find_scene
 from tint_sumo.study import budgets, policy_jobs
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.evaluation import CASES, evaluate
@@ -118,6 +119,19 @@ def test_a_rule_is_tested_on_the_same_cases_as_everyone_but_not_after_parts_of_a
     rule = load_policy("always_go")
     found = evaluate(rule.policy, lambda num_envs: rule.make_venv(num_envs, p_conservative=0.4), 4, CASES)
     assert result.tested[0].evaluation == found
+
+
+def test_a_result_knows_the_headway_of_its_scene(tmp_path: Path) -> None:
+    scene = find_scene("t_intersection")
+    slow = replace(scene, name="slow", population=replace(scene.population, idm=Idm(tau_s=1.5)))
+    closer = Conditions(0.4, tau_s=Idm.tau_s)
+    job = replace(make_job("always_go", None, tmp_path, ((Conditions(0.4), closer), 6)), scene=slow)
+    job.run(silent)
+    result = Result.read(job.result_file)
+    assert result.scene_tau_s == 1.5
+    assert [one.conditions for one in result.tested] == [Conditions(0.4), closer]
+    ends = [[case.time_s for case in one.evaluation.cases] for one in result.tested]
+    assert ends[0] != ends[1]
 
 
 def test_a_policy_is_tested_among_the_drivers_of_its_training_and_after_parts_of_it(study: Path) -> None:

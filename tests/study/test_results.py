@@ -45,6 +45,22 @@ def test_a_file_says_how_the_policy_fared_without_a_look_at_the_cases(study: Pat
     assert (second["success"], second["percent"]) == (0.6, 25)
 
 
+def test_a_file_tells_the_headway_of_the_scene_where_none_was_given(tmp_path: Path) -> None:
+    tested = {Conditions(0.4): (8, 1, 1), Conditions(0.4, tau_s=1.0): (1, 0, 0)}
+    result = replace(trained("oracle", 0, tested), scene_tau_s=1.5)
+    file = write_results([result], tmp_path) / RESULTS / "0.json"
+    assert [one["tau_s"] for one in json.loads(file.read_text())["tested"]] == [1.5, 1.0]
+    assert Result.read(file) == result
+
+
+def test_a_file_without_the_scene_s_headway_is_of_drivers_with_the_default_one(study: Path) -> None:
+    file = study / RESULTS / "0.json"
+    content = json.loads(file.read_text())
+    del content["scene_tau_s"]
+    file.write_text(json.dumps(content))
+    assert read_results(study) == SOME_RESULTS
+
+
 def test_a_policy_that_no_test_is_for_has_no_cases(tmp_path: Path) -> None:
     untested = trained("oracle", 0, {}, mix=0.25)
     assert read_results(write_results([untested], tmp_path)) == [untested]

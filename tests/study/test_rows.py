@@ -1,5 +1,6 @@
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 
@@ -7,7 +8,7 @@ from tests.study.scenes import given, trained
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.evaluation import Case, Evaluation
 from tint_sumo.study.results import TRAINED
-from tint_sumo.study.rows import Row, at_mixes, over_all_mixes, tabulate
+from tint_sumo.study.rows import Row, at_mixes, over_all_mixes, tabulate, varied
 from tint_sumo.study.statistics import Rate, rate_interval
 
 WORLD = Conditions(ALL_MIXES)
@@ -102,6 +103,21 @@ def test_the_main_table_has_the_mixes_and_another_one_the_worlds() -> None:
     assert [row.conditions for row in over_all_mixes(rows)] == [WORLD, NOISY, HALF]
 
 
+def test_rows_tell_the_headway_of_the_scene_s_drivers_where_no_other_one_is_tested() -> None:
+    close = Conditions(ALL_MIXES, tau_s=1.0)
+    result = trained("oracle", 0, dict.fromkeys((close, SLOW, FAST, WORLD), (1, 0, 0)))
+    rows = tabulate([replace(result, scene_tau_s=1.4)])
+    assert [row.conditions for row in rows] == [WORLD, SLOW, close, FAST]
+    assert [row.to_json()["tau_s"] for row in rows] == [1.4, 1.5, 1.0, 0.7]
+    assert list(varied(rows, "tau_s")) == [0.7, 1.0, 1.4, 1.5]
+    assert list(varied(rows, "position_noise_m")) == [0.0]
+
+
+def test_an_only_mix_of_whole_numbers_is_in_the_main_table() -> None:
+    rows = tabulate([given("ttc", {Conditions(1): (1, 0, 0)})])
+    assert at_mixes(rows) == rows
+
+
 def test_rows_are_ready_for_json() -> None:
     lines = [json.loads(json.dumps(row.to_json())) for row in tabulate(SOME_RESULTS)]
     ttc, oracle, over_all = lines[0], lines[3], lines[4]
@@ -116,5 +132,5 @@ def test_rows_are_ready_for_json() -> None:
 def test_collisions_are_counted_over_all_seeds() -> None:
     lower, upper = Case("collision", 4.0, "aggressive", "lower"), Case("collision", 4.0, "conservative", "upper")
     evaluations = (Evaluation((lower, lower)), Evaluation((lower, upper)))
-    row = Row("oracle", TRAINED, ALL_MIXES, WORLD, (0, 1), evaluations)
+    row = Row("oracle", TRAINED, ALL_MIXES, WORLD, (0, 1), evaluations, scene_tau_s=1.0)
     assert row.collisions == {"aggressive, lower": 3, "conservative, upper": 1}

@@ -83,9 +83,13 @@ class Scene:
             raise InputError(f"the ego's goal ({goal_m:g} m) must lie beyond its start ({start_m:g} m)")
         require_at_least(self, 1, "max_vehicles")
         require_positive(self, "step_s", "time_limit_s")
-        tau_s = self.population.idm.tau_s
-        if not self.step_s <= tau_s < math.inf:  # with less, SUMO's drivers hit each other
-            raise InputError(f"tau_s must be at least a step of {self.step_s:g} s, and finite, not {tau_s}")
+        if not self.step_s <= self.tau_s < math.inf:  # with less, SUMO's drivers hit each other
+            raise InputError(f"tau_s must be at least a step of {self.step_s:g} s, and finite, not {self.tau_s}")
+
+    @property
+    def tau_s(self) -> float:
+        """Time headway of the drivers."""
+        return self.population.idm.tau_s
 
     @property
     def digest(self) -> str:

@@ -5,7 +5,6 @@ from typing import Any
 
 from tint_sumo.config import (
     P_CONSERVATIVE,
-    Idm,
     PolicySettings,
     PpoSettings,
     Share,
@@ -14,6 +13,7 @@ from tint_sumo.config import (
     require_distinct,
     require_positive,
     require_share,
+    set_floats,
 )
 from tint_sumo.errors import InputError
 
@@ -27,13 +27,15 @@ class Conditions:
 
     p_conservative: Share
     position_noise_m: float = 0.0
-    tau_s: float = Idm.tau_s
+    tau_s: float | None = None  # time headway of the other drivers; None: the scene's
     percent: int = 100  # part of the training after which the policy is tested
 
     def __post_init__(self) -> None:
         require_share(self.p_conservative)
         require_at_least(self, 0, "position_noise_m")
-        require_positive(self, "tau_s")
+        if self.tau_s is not None:
+            require_positive(self, "tau_s")
+        set_floats(self, "p_conservative", "position_noise_m", "tau_s")
         if self.percent not in (*SNAPSHOTS_PERCENT, 100):
             kept = ", ".join(map(str, (*SNAPSHOTS_PERCENT, 100)))
             raise InputError(f"percent must be one of {kept}, when policies are kept, not {self.percent}")
@@ -47,14 +49,22 @@ class Conditions:
     def world(self) -> dict[str, Any]:
         """What the environments are told; the headway is the scene's unless another one is tested."""
         told = {"p_conservative": self.p_conservative, "position_noise_m": self.position_noise_m}
-        return told if self.tau_s == Idm.tau_s else {**told, "tau_s": self.tau_s}
+        return told if self.tau_s is None else {**told, "tau_s": self.tau_s}
+
+    def resolved(self, scene_tau_s: float) -> "Conditions":
+        """Return these conditions with the headway of the scene's drivers where none is given."""
+        return self if self.tau_s is not None else replace(self, tau_s=scene_tau_s)
+
+    def relative_to(self, scene_tau_s: float) -> "Conditions":
+        """Return these conditions with None for a headway that is the scene's: the form in which they are compared."""
+        return replace(self, tau_s=None) if self.tau_s == scene_tau_s else self
 
     @property
     def label(self) -> str:
         """What differs from the world of the training, for tables and figures."""
         parts = [
             f"noise {self.position_noise_m:g} m" if self.position_noise_m else "",
-            f"tau {self.tau_s:g} s" if self.tau_s != Idm.tau_s else "",
+            f"tau {self.tau_s:g} s" if self.tau_s is not None else "",
             f"{self.percent} % of training" if self.percent != 100 else "",
         ]
         return ", ".join(part for part in parts if part) or "as trained"
@@ -69,6 +79,10 @@ class Trials:
 
     def __post_init__(self) -> None:
         require_at_least(self, 1, "episodes")
+
+    def relative_to(self, scene_tau_s: float) -> "Trials":
+        """Return these trials with None for headways that are the scene's."""
+        return replace(self, conditions=tuple(one.relative_to(scene_tau_s) for one in self.conditions))
 
 
 @dataclass(frozen=True)

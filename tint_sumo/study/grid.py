@@ -27,14 +27,15 @@ def plan(budget: Budget, out: Path, scene: str | Scene = T_INTERSECTION) -> list
     encoders = dict.fromkeys(method.encoder for method in learned if method.encoder)
     traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
     given = rules + (shipped_policies() if budget.with_shipped and scene == T_INTERSECTION else [])
+    trials = tuple(one.relative_to(find_scene(scene).tau_s) for one in budget.trials)
     jobs: list[Job] = [*traits]
     for seed in budget.seeds:
         grid = [(method.name, mix, seed) for mix in budget.mixes for method in learned]
         trainings = [TrainJob(*policy, budget.ppo, budget.traits is None, out, scene) for policy in grid]
         jobs += sorted(trainings, key=lambda job: len(job.needs))
-        jobs += [EvaluateJob(*policy, budget.trials, out, scene) for policy in grid]
-    tests = [EvaluateJob(name, None, 0, budget.trials, out, scene) for name in given]
-    return [*jobs, CeilingJob(budget.trials, out, scene), *tests]
+        jobs += [EvaluateJob(*policy, trials, out, scene) for policy in grid]
+    tests = [EvaluateJob(name, None, 0, trials, out, scene) for name in given]
+    return [*jobs, CeilingJob(trials, out, scene), *tests]
 
 
 def run_study(

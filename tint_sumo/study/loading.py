@@ -44,7 +44,7 @@ class Contender:
     def tau_s(self) -> float | None:
         """Time headway of the scene's drivers; None in a SUMO configuration."""
         scene = find_scene(self.scene)
-        return None if isinstance(scene, OwnScene) else scene.population.idm.tau_s
+        return None if isinstance(scene, OwnScene) else scene.tau_s
 
     def make_venv(self, num_envs: int, **task: Any) -> VecEnv:
         """Environments with the observations the policy takes; ``task`` as in ``SceneEnv``.

@@ -13,7 +13,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import write_json
 from tint_sumo.progress import Report, part_of
-from tint_sumo.scenes import T_INTERSECTION, AnyScene
+from tint_sumo.scenes import T_INTERSECTION, AnyScene, Scene, find_scene
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Conditions, Trials
 from tint_sumo.study.evaluation import CASES, Evaluation, evaluate
@@ -105,7 +105,7 @@ class EvaluateJob:
     seed: int
     trials: tuple[Trials, ...]
     out: Path  # folder of the study
-    scene: AnyScene = T_INTERSECTION
+    scene: str | Scene = T_INTERSECTION
     cases: int = CASES  # which set of cases
 
     uses_gpu = False
@@ -157,7 +157,8 @@ class EvaluateJob:
             tested.append(Measured(conditions, evaluation))
             done += episodes
         origin = GIVEN if self.mix is None else TRAINED
-        result = Result(self.method, origin, self.mix, self.seed, tuple(tested), self.cases)
+        scene_tau_s = find_scene(self.scene).tau_s
+        result = Result(self.method, origin, self.mix, self.seed, tuple(tested), self.cases, scene_tau_s)
         write_json(self.result_file, result.to_json())
         successes = ", ".join(f"{one.evaluation.rate('success').value:.1%}" for one in tested)
         return f"success {successes}"

@@ -66,7 +66,7 @@ def to_csv(rows: Sequence[Row], ceilings: Ceilings) -> str:
     closing = ["navigation_time_s", "episodes", "seeds", "ceiling_percent", *published]
     writer.writerow(["method", "origin", *world, *measured, *closing])
     for row in rows:
-        conditions, time_s = row.conditions, row.navigation_time_s
+        conditions, time_s = row.resolved, row.navigation_time_s
         ceiling = ceilings.get(_number(row))
         numbers: list[str] = []
         for outcome in OUTCOMES:

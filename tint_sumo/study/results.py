@@ -4,7 +4,7 @@ from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any
 
-from tint_sumo.config import Share
+from tint_sumo.config import Idm, Share
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
@@ -33,6 +33,7 @@ class Result:
     seed: int
     tested: tuple[Measured, ...]
     case_set: int = CASES
+    scene_tau_s: float = Idm.tau_s  # headway of the scene's drivers, where conditions give none
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -41,9 +42,10 @@ class Result:
             "mix": self.mix,
             "seed": self.seed,
             "case_set": self.case_set,
+            "scene_tau_s": self.scene_tau_s,
             "tested": [
                 {
-                    **asdict(one.conditions),
+                    **asdict(one.conditions.resolved(self.scene_tau_s)),
                     **one.evaluation.summary(),
                     "cases": [astuple(case) for case in one.evaluation.cases],
                 }
@@ -56,9 +58,12 @@ class Result:
         """Raises InputError if the file is damaged."""
         content = read_json(file, "result of a study")
         try:
-            tested = tuple(Measured(_conditions(one), _evaluation(one)) for one in content["tested"])
+            scene_tau_s = float(content.get("scene_tau_s", Idm.tau_s))
+            tested = tuple(
+                Measured(_conditions(one).relative_to(scene_tau_s), _evaluation(one)) for one in content["tested"]
+            )
             mix, seed, case_set = _share(content["mix"]), int(content["seed"]), int(content.get("case_set", CASES))
-            result = cls(content["method"], content["origin"], mix, seed, tested, case_set)
+            result = cls(content["method"], content["origin"], mix, seed, tested, case_set, scene_tau_s)
         except (LookupError, TypeError, ValueError) as error:
             raise InputError(f"{file} is damaged ({error!r}); remove it and run the study again") from None
         all_cases = [one.evaluation.cases for one in tested]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tint_sumo.config import Idm, Share, ends
+from tint_sumo.config import Share, ends
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import Evaluation
@@ -34,6 +34,12 @@ class Row:
     conditions: Conditions
     seeds: tuple[int, ...]
     evaluations: tuple[Evaluation, ...]  # one for each seed
+    scene_tau_s: float  # headway of the scene's drivers
+
+    @property
+    def resolved(self) -> Conditions:
+        """The conditions with the scene's headway where none was given."""
+        return self.conditions.resolved(self.scene_tau_s)
 
     @property
     def is_shipped(self) -> bool:
@@ -98,7 +104,7 @@ class Row:
             "origin": self.origin,
             "p_conservative": self.conditions.p_conservative,
             "position_noise_m": self.conditions.position_noise_m,
-            "tau_s": self.conditions.tau_s,
+            "tau_s": self.resolved.tau_s,
             "percent": self.conditions.percent,
             "seeds": list(self.seeds),
             "episodes": self.episodes,
@@ -118,11 +124,12 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
 
     def key(pair: tuple[Result, Any]) -> tuple[Any, ...]:
         result, conditions = pair[0], pair[1].conditions
+        headway_s = 0.0 if conditions.tau_s is None else conditions.tau_s - result.scene_tau_s
         return (
             -conditions.percent,
             conditions.position_noise_m,
-            abs(conditions.tau_s - Idm.tau_s),
-            conditions.tau_s,
+            abs(headway_s),  # the difference from the scene's
+            headway_s,
             isinstance(conditions.p_conservative, tuple),
             conditions.p_conservative,
             order.get(result.method, len(order)),
@@ -137,7 +144,9 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
         first, tested = members[0]
         seeds = tuple(result.seed for result, _ in members)
         evaluations = tuple(one.evaluation for _, one in members)
-        rows.append(Row(first.method, first.origin, first.mix, tested.conditions, seeds, evaluations))
+        rows.append(
+            Row(first.method, first.origin, first.mix, tested.conditions, seeds, evaluations, first.scene_tau_s)
+        )
     return rows
 
 
@@ -169,4 +178,4 @@ def varied(rows: Sequence[Row], name: str) -> dict[float, Row]:
     """The rows that differ from the world of the training in at most one condition, by its values in their order."""
     base = Conditions(rows[0].conditions.p_conservative)
     shown = [row for row in rows if replace(row.conditions, **{name: getattr(base, name)}) == base]
-    return dict(sorted(((getattr(row.conditions, name), row) for row in shown), key=lambda pair: pair[0]))
+    return dict(sorted(((getattr(row.resolved, name), row) for row in shown), key=lambda pair: pair[0]))

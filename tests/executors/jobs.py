@@ -52,8 +52,15 @@ class FileJob:
         return self.path("done").exists()
 
     def run(self, report: Report) -> str:
-        write_text(self.path("pid"), str(os.getpid()))
         write_text(self.path("tries"), str(self.tries + 1))
+        try:
+            return self._run(report)
+        except KeyboardInterrupt:
+            write_text(self.path("interrupted"), "")
+            raise
+
+    def _run(self, report: Report) -> str:
+        write_text(self.path("pid"), str(os.getpid()))
         for done in range(self.reports):
             report(Progress(done, self.reports, "line", {"success": 0.5}))
             time.sleep(0.3 * (self.reports > 1))
@@ -61,11 +68,7 @@ class FileJob:
             raise InputError("this is not for me")
         if self.failure == "died" or (self.failure == "died once" and self.tries == 1):
             os._exit(7)
-        try:
-            time.sleep(self.patience_s)
-        except KeyboardInterrupt:
-            write_text(self.path("interrupted"), "")
-            raise
+        time.sleep(self.patience_s)
         missing = [one for one in self.needs if not (self.out / f"{one}.done").exists()]
         write_text(self.path("done"), " ".join(missing))
         return "written"

@@ -62,6 +62,29 @@ def test_done_jobs_are_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("needs", "line"),
+    [
+        ({"a": ("b",), "c": ()}, "job 'a' needs 'b', which is none of the jobs; run it with them"),
+        ({"a": ("c",), "b": ("a",), "c": ("b",)}, "jobs need each other: a -> c -> b -> a"),
+        ({"a": ("a",)}, "jobs need each other: a -> a"),
+    ],
+)
+def test_jobs_that_would_wait_for_ever_are_refused(
+    tmp_path: Path, needs: dict[str, tuple[str, ...]], line: str
+) -> None:
+    jobs = [FileJob(name, tmp_path, needed) for name, needed in needs.items()]
+    with pytest.raises(InputError, match=f"^{re.escape(line)}$"):
+        Local(1).run(jobs)
+    assert not list(tmp_path.iterdir())
+
+
+def test_jobs_with_the_same_name_are_refused(tmp_path: Path) -> None:
+    jobs = [FileJob("same", tmp_path / "a"), FileJob("same", tmp_path / "b")]
+    with pytest.raises(InputError, match=r"^two jobs are called 'same'; give each its own name$"):
+        Local(1).run(jobs)
+
+
+@pytest.mark.parametrize(
     ("failure", "error", "tries"),
     [("refused", InputError, 1), ("died", JobError, 3)],
 )

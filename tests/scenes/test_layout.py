@@ -38,12 +38,6 @@ def test_no_two_scenes_have_one_name() -> None:
         find_scene("moon")
 
 
-def test_the_digest_is_of_roads_and_task_and_not_of_drivers() -> None:
-    assert replace(T, traffic=replace(T.traffic, p_conservative=0.9)).digest == T.digest
-    assert replace(T, ego=replace(T.ego, goal_m=30.0)).digest != T.digest
-    assert find_scene("t_intersection_right").digest != T.digest
-
-
 @scenes
 def test_lanes_join_up_into_smooth_ways(name: str) -> None:
     found = layout(find_scene(name))

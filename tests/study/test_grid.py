@@ -174,6 +174,15 @@ def test_ma_needs_the_oracle_s_training_with_the_same_seed_and_mix(tmp_path: Pat
     }
 
 
+def test_a_training_that_is_shared_is_done_without_its_method_being_asked_for(tmp_path: Path, budget: Budget) -> None:
+    jobs = plan(replace(budget, methods=("ma",)), tmp_path)
+    assert [job.name for job in jobs if isinstance(job, TrainJob | policy_jobs.EvaluateJob)] == [
+        "train oracle-P0.4-seed0",
+        "train ma-P0.4-seed0",
+        "evaluate ma-P0.4-seed0",
+    ]
+
+
 def test_shipped_policies_are_tested_where_the_budget_says_so(
     tmp_path: Path, budget: Budget, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Literal, Protocol, TypeVar
 
@@ -41,7 +42,7 @@ class Job(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the jobs that must be done before; they come before it in a sequence of jobs."""
+        """Names of the jobs, run together with it, that must be done before."""
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -88,7 +89,8 @@ class Executor(Protocol):
         A job that fails three times, or is refused once, is given up, and so are those that need it.
 
         Raises:
-            InputError, JobError: jobs were refused, or failed; all others are done.
+            InputError: needs are of no job, or go round in a circle; nothing is done.
+        InputError, JobError: jobs were refused, or failed; all others are done.
         """
 
     def map(self, work: Work[T], numbers: Iterable[int]) -> AbstractContextManager[Iterator[T]]:
@@ -136,6 +138,7 @@ class Host(Protocol):
 
 def run_jobs(jobs: Sequence[Job], host: Host, progress: bool = True) -> None:
     """``Executor.run`` on a host."""
+    require_order(jobs)
     ledger = _Ledger([job for job in jobs if not job.is_done()])
     titles = [job.title for job in ledger.waiting]
     with job_table(titles, len(jobs) - len(titles), progress=progress) as table:
@@ -149,6 +152,21 @@ def run_jobs(jobs: Sequence[Job], host: Host, progress: bool = True) -> None:
         finally:
             host.interrupt()
     ledger.require_all_done()
+
+
+def require_order(jobs: Sequence[Job]) -> None:
+    """Raise InputError unless every job has its own name and can wait for what it needs."""
+    needs = {job.name: job.needs for job in jobs}
+    twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
+    if twice:
+        raise InputError(f"two jobs are called {twice[0]!r}; give each its own name")
+    for name, needed in needs.items():
+        if missing := [one for one in needed if one not in needs]:
+            raise InputError(f"job {name!r} needs {missing[0]!r}, which is none of the jobs; run it with them")
+    try:
+        TopologicalSorter(needs).prepare()
+    except CycleError as error:
+        raise InputError(f"jobs need each other: {' -> '.join(reversed(error.args[1]))}") from None
 
 
 def _tell(table: JobTable, ledger: "_Ledger", job: Job, news: News) -> None:

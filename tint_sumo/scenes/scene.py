@@ -6,7 +6,7 @@ A new scene is a file that makes one, and a line in ``tint_sumo/scenes/__init__.
 import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, overload
 
 from tint_sumo.config import (
@@ -19,6 +19,7 @@ from tint_sumo.config import (
     require_positive,
 )
 from tint_sumo.errors import InputError, find_named
+from tint_sumo.scenes.digest import scene_digest
 from tint_sumo.scenes.network import Network, Point
 
 if TYPE_CHECKING:
@@ -94,9 +95,7 @@ class Scene:
     @property
     def digest(self) -> str:
         """What tells the roads, the vehicles and the ego's task from others'; drivers and their mix do not count."""
-        parts = (self.network, self.routes, self.ego, self.vehicle, self.claim, self.step_s, self.max_vehicles)
-        text = repr([part if isinstance(part, int | float | tuple) else asdict(part) for part in parts])
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return scene_digest(self)
 
 
 T_INTERSECTION = "t_intersection"  # the paper's scene

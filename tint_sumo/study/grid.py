@@ -12,7 +12,7 @@ from tint_sumo.study.budgets import Budget
 from tint_sumo.study.ceiling_job import CeilingJob
 from tint_sumo.study.folders import DATASET
 from tint_sumo.study.loading import shipped_policies
-from tint_sumo.study.methods import Learned, find_method
+from tint_sumo.study.methods import Learned, find_learned, find_method, with_shared_trainings
 from tint_sumo.study.page import write_page
 from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
 from tint_sumo.study.report import StudyReport, write_report
@@ -21,19 +21,22 @@ from tint_sumo.study.trait_job import SEED, TraitJob
 
 def plan(budget: Budget, out: Path, scene: str | Scene = T_INTERSECTION) -> list[Job]:
     """All jobs after the recording, those that hold up others or take longest first, one seed after the other."""
-    found = [find_method(name) for name in budget.methods]
-    learned = [method for method in found if isinstance(method, Learned)]
-    rules = [method.name for method in found if not isinstance(method, Learned)]
-    encoders = dict.fromkeys(method.encoder for method in learned if method.encoder)
+    learned = [name for name in budget.methods if isinstance(find_method(name), Learned)]
+    rules = [name for name in budget.methods if name not in learned]
+    trained = with_shared_trainings(learned)
+    encoders = dict.fromkeys(filter(None, (find_learned(name).encoder for name in trained)))
     traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
     given = rules + (shipped_policies() if budget.with_shipped and scene == T_INTERSECTION else [])
     trials = tuple(one.relative_to(find_scene(scene).tau_s) for one in budget.trials)
     jobs: list[Job] = [*traits]
     for seed in budget.seeds:
-        grid = [(method.name, mix, seed) for mix in budget.mixes for method in learned]
-        trainings = [TrainJob(*policy, budget.ppo, budget.traits is None, out, scene) for policy in grid]
+        trainings = [
+            TrainJob(name, mix, seed, budget.ppo, budget.traits is None, out, scene)
+            for mix in budget.mixes
+            for name in trained
+        ]
         jobs += sorted(trainings, key=lambda job: len(job.needs))
-        jobs += [EvaluateJob(*policy, trials, out, scene) for policy in grid]
+        jobs += [EvaluateJob(name, mix, seed, trials, out, scene) for mix in budget.mixes for name in learned]
     tests = [EvaluateJob(name, None, 0, trials, out, scene) for name in given]
     return [*jobs, CeilingJob(trials, out, scene), *tests]
 

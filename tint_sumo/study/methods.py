@@ -1,6 +1,6 @@
 """The methods of the study. A new one is one entry here (and its rule or trait source)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -103,6 +103,13 @@ def find_learned(name: str) -> Learned:
         learned = ", ".join(one.name for one in METHODS.values() if isinstance(one, Learned))
         raise InputError(f"{name!r} is a hand-written rule and needs no training; choose one of: {learned}")
     return method
+
+
+def with_shared_trainings(names: Iterable[str]) -> list[str]:
+    """Return the names of learned methods, those whose training others share first, each of them once."""
+    methods = [find_learned(name) for name in names]
+    shared = [method.trained_as for method in methods if method.trained_as is not None]
+    return list(dict.fromkeys([*shared, *(method.name for method in methods)]))
 
 
 register(Rule("always_go", "always go", lambda _: AlwaysGo()))

@@ -31,7 +31,7 @@ from tint_sumo.structures import overlay, require_fields
 from tint_sumo.study.budgets import ALL_MIXES, Conditions, Trials
 from tint_sumo.study.evaluation import TUNING_CASES, require_cases, require_seed
 from tint_sumo.study.grid import require_scene
-from tint_sumo.study.methods import METHODS, Learned, find_learned
+from tint_sumo.study.methods import METHODS, Learned, find_learned, with_shared_trainings
 from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
 from tint_sumo.study.results import Result
 from tint_sumo.study.tables import Lines, Table
@@ -208,12 +208,10 @@ class VariantJob:
 
 def _trainings(sweep: Sweep, out: Path) -> list[VariantJob]:
     """Those of the methods, and of others whose training they share; these come first."""
-    shared = [find_learned(name).trained_as for name in sweep.methods]
-    methods = dict.fromkeys([*filter(None, shared), *sweep.methods])
     return [
         VariantJob(variant, TrainJob(method, sweep.p_conservative, seed, settings, True, out, sweep.scene), out)
         for variant, settings in sweep.variants.items()
-        for method in methods
+        for method in with_shared_trainings(sweep.methods)
         for seed in sweep.seeds
     ]
 

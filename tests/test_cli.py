@@ -19,6 +19,7 @@ from tint_sumo import traits
 from tint_sumo.cli import main
 from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.recorder import record
+from tint_sumo.stores import name_in
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import Case, Evaluation
 from tint_sumo.study.folders import RESULTS
@@ -240,19 +241,36 @@ def test_policies_are_evaluated_in_other_worlds(capsys: pytest.CaptureFixture[st
     assert plain["navigation_time_s"] != other["navigation_time_s"]
 
 
-def test_study_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture(scope="session")
+def small_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study of three cases."""
+    out = tmp_path_factory.mktemp("results")
     cases = Evaluation((Case("success", 12.0),) * 3)
     result = Result("ttc", GIVEN, None, 0, (Measured(Conditions(0.4), cases),))
-    (tmp_path / RESULTS).mkdir()
-    (tmp_path / RESULTS / "one.json").write_text(json.dumps(result.to_json()))
-    printed = run(capsys, "study", "report", "--out", tmp_path)
+    (out / RESULTS).mkdir()
+    (out / RESULTS / "one.json").write_text(json.dumps(result.to_json()))
+    assert main(["study", "report", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.mark.parametrize("named", ["r/", "./", "e", "file"])
+def test_study_report_names_its_files_as_the_user_does(
+    named: str, small_study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path if named == "./" else tmp_path / named
+    copy(small_study, folder)
+    monkeypatch.chdir(tmp_path)
+    out = folder.as_uri() if named == "file" else named
+    printed = run(capsys, "study", "report", "--out", out)
+    assert list(printed) == ["results", "files"]
     assert [(row["method"], row["success"]) for row in printed["results"]] == [("ttc", 1.0)]
-    assert [Path(file).name for file in printed["files"]] == ["results.csv", "results.md", "results.png", "report.html"]
-    assert all(Path(file).is_file() for file in printed["files"])
-    assert main(["study", "report", "--out", tmp_path.as_uri()]) == 0
+    names = ["results.csv", "results.md", "results.png", "report.html"]
+    assert printed["files"] == [name_in(out, name) for name in names]
+    assert all((folder / name).is_file() for name in names)
+    assert main(["study", "report", "--out", out]) == 0
     text = capsys.readouterr().out
     assert "| time to collision |" in text
-    assert all(f"wrote file://{file}" in text for file in printed["files"])
+    assert all(f"wrote {file}\n" in text for file in printed["files"])
 
 
 # Bad input

@@ -17,9 +17,9 @@ import pytest
 
 from tint_sumo import changes, stores
 from tint_sumo.changes import Changes
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, JobError
 from tint_sumo.files import claim_folder
-from tint_sumo.stores import Store, is_url, working_folder
+from tint_sumo.stores import Store, is_url, name_in, working_folder
 
 
 @pytest.fixture(params=["s3", "file"])
@@ -45,6 +45,21 @@ def wait_until(condition: Callable[[], bool], limit_s: float = 30.0) -> None:
 )
 def test_what_is_a_url(out: str | Path, expected: bool) -> None:
     assert is_url(out) is expected
+
+
+@pytest.mark.parametrize(
+    ("out", "name"),
+    [
+        ("r/", "r/a/b.csv"),
+        ("./", "a/b.csv"),
+        ("e", "e/a/b.csv"),
+        (Path("/x"), "/x/a/b.csv"),
+        ("s3://bucket/x/", "s3://bucket/x/a/b.csv"),
+        ("s3://KEY:SECRET@bucket?region=here", "s3://bucket/a/b.csv?region=here"),
+    ],
+)
+def test_files_are_called_by_the_name_that_the_user_knows(out: str | Path, name: str) -> None:
+    assert name_in(out, Path("a/b.csv")) == name
 
 
 def test_files_come_and_go(url: str) -> None:
@@ -240,6 +255,16 @@ def test_a_run_at_a_url_is_resumed_and_another_one_refused(url: str) -> None:
     with pytest.raises(InputError, match=message), working_folder(url) as folder, claim_folder(folder, {"seed": 2}):
         pytest.fail("the block must not begin")
     assert set(Store(url).files()) == {"half", "run.json"}
+
+
+@pytest.mark.parametrize("kind", [InputError, JobError])
+def test_errors_name_files_as_the_user_knows_them(kind: type[Exception], tmp_path: Path) -> None:
+    url = f"file://{tmp_path}/store"
+    with (
+        pytest.raises(kind, match=f"^{url}: {url}/a/b.csv is damaged, see {url}/c; {tmp_path}$"),
+        working_folder(url) as at,
+    ):
+        raise kind(f"{at}: {at}/a/b.csv is damaged, see {at}/c; {tmp_path}")
 
 
 def test_files_are_sent_while_the_block_runs(url: str, monkeypatch: pytest.MonkeyPatch) -> None:

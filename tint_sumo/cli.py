@@ -3,7 +3,7 @@
 import io
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -34,7 +34,8 @@ from tint_sumo.configuration import (
 from tint_sumo.errors import InputError, JobError
 from tint_sumo.processes import end_quickly, interrupt_on_sigterm
 from tint_sumo.provenance import Origin, made_by
-from tint_sumo.stores import working_folder
+from tint_sumo.redaction import redact
+from tint_sumo.stores import name_in, working_folder
 from tint_sumo.structures import Where
 
 if TYPE_CHECKING:
@@ -59,11 +60,6 @@ class Outcome:
 
     text: str
     content: dict[str, Any]
-
-    def naming(self, out: str, folder: Path) -> "Outcome":
-        """With the place that the user has named where the folder is named that stands for it."""
-        content = json.loads(json.dumps(self.content).replace(str(folder), out))
-        return Outcome(self.text.replace(str(folder), out), content)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,7 +261,7 @@ class InspectDataset(Command):
         text = report(found)
         if self.figure is not None:
             plot(found, self.figure)
-            text += f"\nwrote {self.figure}"
+            text = "\n".join([text, *_wrote([str(self.figure)])])
         return Outcome(text, {"data": str(self.data), **found.summary()})
 
 
@@ -366,7 +362,8 @@ class PlotTraits(Command):
 
         _use_one_thread()
         files = plot_traits(self.data, self.model, self.out, noise_m=self.noise, other_scene=self.other_scene)
-        return Outcome("\n".join(f"wrote {file}" for file in files), {"files": [str(file) for file in files]})
+        names = [str(file) for file in files]
+        return Outcome("\n".join(_wrote(names)), {"files": names})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -416,9 +413,9 @@ class StudyTraits(SpreadCommand):
 
         with working_folder(self.out) as out, self.workers_of(self.workers) as workers:
             report = run_trait_study(_TRAIT_STUDY.full(self.budget), out, workers=workers)
-        files = [str(file) for file in (report.csv_file, report.markdown_file, report.figure_file)]
-        text = "\n".join([report.markdown, *(f"wrote {file}" for file in files)])
-        return Outcome(text, {"results": report.table.to_dict("records"), "files": files}).naming(self.out, out)
+        files = _names(self.out, out, (report.csv_file, report.markdown_file, report.figure_file))
+        text = "\n".join([report.markdown, *_wrote(files)])
+        return Outcome(text, {"results": report.table.to_dict("records"), "files": files})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -581,10 +578,10 @@ class SweepPolicy(SpreadCommand):
         )
         with working_folder(self.out) as out, self.workers_of(self.workers, self.gpus_per_job) as workers:
             table = run_sweep(sweep, out, workers=workers)
-        files = [str(out / "sweep.csv"), str(out / "sweep.md")]
-        text = "\n".join([report_markdown(table, self.episodes), *(f"wrote {file}" for file in files)])
+        files = [name_in(self.out, name) for name in ("sweep.csv", "sweep.md")]
+        text = "\n".join([report_markdown(table, self.episodes), *_wrote(files)])
         rows = table.astype(object).where(table.notna(), None).to_dict("records")
-        return Outcome(text, {"results": rows, "files": files}).naming(self.out, out)
+        return Outcome(text, {"results": rows, "files": files})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -605,21 +602,18 @@ class RunStudy(SpreadCommand):
     """Share of a GPU for each training, with --executor ray and where the cluster has GPUs."""
 
     def run(self) -> Outcome:
+        from tint_sumo.study.folders import DATASET
         from tint_sumo.study.grid import run_study
 
         place = self._place()
         with working_folder(place) as out:
             with self.workers_of(self.workers, self.gpus_per_job) as workers:
                 report = run_study(_BUDGET.full(self.budget), out, scene=self.scene, workers=workers)
-            outcome = _report_outcome(report)
-            made = [
-                out / "dataset",
-                *sorted(out.glob("traits/*/latent.png")),
-                *sorted(out.glob("policies/*/policy.safetensors")),
-            ]
-        lines = "\n".join(f"wrote {path}" for path in made)
-        content = {**outcome.content, "made": [str(path) for path in made]}
-        return Outcome(f"{outcome.text}\n{lines}", content).naming(place, out)
+            found = sorted(out.glob("traits/*/latent.png")) + sorted(out.glob("policies/*/policy.safetensors"))
+            made = _names(place, out, [out / DATASET, *found])
+        outcome = _report_outcome(report, place, out)
+        text = "\n".join([outcome.text, *_wrote(made)])
+        return Outcome(text, {**outcome.content, "made": made})
 
     def _place(self) -> str:
         if self.out is not None:
@@ -641,8 +635,8 @@ class ReportStudy(Command):
         from tint_sumo.study.report import write_report
 
         with working_folder(self.out) as out:
-            outcome = _report_outcome(write_page(write_report(out), out))
-        return outcome.naming(self.out, out)
+            report = write_page(write_report(out), out)
+        return _report_outcome(report, self.out, out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -679,7 +673,7 @@ class StudyScenes(Command):
 
         table = run_scene_study(_SCENE_STUDY.full(self.budget), self.out, workers=self.workers)
         files = [str(self.out / "scenes.csv"), str(self.out / "scenes.md")]
-        text = "\n".join([report_markdown(table), *(f"wrote {file}" for file in files)])
+        text = "\n".join([report_markdown(table), *_wrote(files)])
         return Outcome(text, {"results": table.to_dict("records"), "files": files})
 
 
@@ -819,7 +813,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with made_by(Origin(tuple(words), partial(write_command, command))):
             outcome = command.run()
     except (InputError, JobError) as error:
-        print(f"tint-sumo: error: {error}", file=sys.stderr)
+        print(f"tint-sumo: error: {redact(str(error))}", file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
     except OSError as error:
         if error.filename is None:
@@ -829,9 +823,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\ntint-sumo: interrupted; all files are whole" + after_interrupt, file=sys.stderr)
         return 130
-    print(outcome.text)
+    print(redact(outcome.text))
     if command.json:
-        print(json.dumps(outcome.content))
+        print(redact(json.dumps(outcome.content)))
     return 0
 
 
@@ -911,10 +905,21 @@ def _use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _report_outcome(report: "StudyReport") -> Outcome:
-    files = [report.csv_file, report.markdown_file, *report.figure_files, report.page_file]
-    text = "\n".join([report.markdown, *(f"wrote {file}" for file in files)])
-    return Outcome(text, {"results": [row.to_json() for row in report.rows], "files": [str(file) for file in files]})
+def _report_outcome(report: "StudyReport", out: str, folder: Path) -> Outcome:
+    """What a report says, of the study that the user calls ``out`` and that was written in ``folder``."""
+    files = _names(out, folder, (report.csv_file, report.markdown_file, *report.figure_files, report.page_file))
+    text = "\n".join([report.markdown, *_wrote(files)])
+    return Outcome(text, {"results": [row.to_json() for row in report.rows], "files": files})
+
+
+def _names(out: str, folder: Path, files: Iterable[Path | None]) -> list[str]:
+    """What the user calls files of a folder that stands for the output folder ``out``."""
+    return [name_in(out, file.relative_to(folder)) for file in files if file is not None]
+
+
+def _wrote(files: Iterable[str]) -> Iterator[str]:
+    """Lines that tell of the files that were written."""
+    return (f"wrote {file}" for file in files)
 
 
 if __name__ == "__main__":

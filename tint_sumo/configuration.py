@@ -10,6 +10,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from tint_sumo.redaction import redact
 from tint_sumo.structures import FieldError, Where, build, choose, is_required, require_fields
 from tint_sumo.yaml_files import YamlFile, field_notes, read_yaml, to_yaml
 
@@ -113,11 +114,14 @@ def _marks(hint: Any) -> tuple[Any, ...]:
 
 
 def write_command(command: Any) -> str:
-    """A configuration file with all values of a command; ``read_command`` makes the same command of it."""
+    """A configuration file with all values of a command; ``read_command`` makes the same command of it.
+
+    Credentials in URLs are left out.
+    """
     hints = get_type_hints(type(command), include_extras=True)
     values = {one.name: getattr(command, one.name) for one in fields(command) if one.name not in NO_SETTINGS}
     for name, value in values.items():
         named = _from_file(hints[name])
         values[name] = value if named is None else named.full(value)
     helped = {name: mark.help for name, hint in hints.items() for mark in _marks(hint) if getattr(mark, "help", None)}
-    return to_yaml(values, {**field_notes(type(command)), **helped})
+    return redact(to_yaml(values, {**field_notes(type(command)), **helped}))

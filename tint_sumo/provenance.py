@@ -12,6 +12,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from tint_sumo.redaction import redact
+
 PROVENANCE_FILE = "provenance.json"
 CONFIG_FILE = "config.yaml"
 _CHECKOUT = Path(__file__).resolve().parents[1]
@@ -36,8 +38,8 @@ class Origin:
     config: Callable[[], str]  # gives the configuration file that says the same
 
     def provenance(self, *, with_versions: bool) -> dict[str, Any]:
-        """What JSON can hold of it, and of the code."""
-        told = {"command": shlex.join(["tint-sumo", *self.words]), "commit": commit()}
+        """What JSON can hold of it, and of the code; without credentials."""
+        told = {"command": redact(shlex.join(["tint-sumo", *self.words])), "commit": commit()}
         return {**told, "versions": versions(PACKAGES)} if with_versions else told
 
 

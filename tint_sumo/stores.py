@@ -16,8 +16,9 @@ from urllib.parse import parse_qsl, quote, urlencode, urlsplit, urlunsplit
 from uuid import uuid4
 
 from tint_sumo.changes import Changes
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, JobError
 from tint_sumo.files import is_temporary, write_bytes
+from tint_sumo.redaction import redact
 
 PUSH_INTERVAL_S = 15.0
 
@@ -38,6 +39,14 @@ _ADVICE_ON_OTHERS = "use a URL such as s3://bucket/folder, gs://bucket/folder or
 def is_url(out: str | Path) -> bool:
     """Whether an output place is given as a URL; as a Path it would have lost a slash, so URLs stay text."""
     return "://" in str(out)
+
+
+def name_in(out: str | Path, path: PurePosixPath | Path | str) -> str:
+    """Return what the user calls a file of the output folder ``out``, a folder or a URL; ``path`` is relative to it."""
+    if not is_url(out):
+        return str(Path(out) / path)
+    folder, mark, options = redact(str(out)).partition("?")
+    return f"{folder.rstrip('/')}/{PurePosixPath(path)}{mark}{options}"
 
 
 @dataclass(frozen=True)
@@ -69,7 +78,7 @@ class Store:
             bucket = base.split("/")[0]
             no_bucket = not infos and bucket and filesystem.get_file_info(bucket).type == FileType.NotFound
         if no_bucket:
-            raise InputError(_without_secrets(f"cannot read {self.url}: there is no bucket {bucket!r}; make it first"))
+            raise InputError(redact(f"cannot read {self.url}: there is no bucket {bucket!r}; make it first"))
         sizes = {info.path.removeprefix(base).lstrip("/"): info.size for info in infos}
         return {path: sizes[path] for path in sorted(sizes) if _is_ours(PurePosixPath(path))}
 
@@ -142,7 +151,7 @@ class Store:
         except (OSError, ValueError, NotImplementedError) as error:
             reason = " ".join(str(error).split())
             advice = _ADVICE.get(self.url.split(":")[0], _ADVICE_ON_OTHERS)
-            raise InputError(_without_secrets(f"cannot {doing} {self.url}: {reason}; {advice}")) from None
+            raise InputError(redact(f"cannot {doing} {self.url}: {reason}; {advice}")) from None
 
 
 @contextmanager
@@ -176,10 +185,15 @@ def working_folder(out: str | Path, without: tuple[str, ...] = ()) -> Iterator[P
             kept = folder.rename(f"{home}_not_sent")
             raise InputError(f"{error}; everything is kept in {kept}") from None
         except InputError as error:
-            if str(folder) not in str(error):
-                raise
-            # the user knows the URL, not the folder
-            raise InputError(str(error).replace(str(folder), _without_secrets(store.url))) from None
+            raise InputError(_renamed(str(error), folder, store.url)) from None
+        except JobError as error:
+            raise JobError(_renamed(str(error), folder, store.url)) from None
+
+
+def _renamed(message: str, folder: Path, url: str) -> str:
+    """Name files as the user does in a message that names those of ``folder``, whose name nothing else can have."""
+    path = re.compile(rf"{re.escape(str(folder))}(?:/([^\s:;,()'\"]*))?")
+    return path.sub(lambda found: name_in(url, found[1]) if found[1] else redact(url), message)
 
 
 class _PushError(InputError):
@@ -228,8 +242,3 @@ def _put(filesystem: Any, path: str, content: bytes) -> None:
 
 def _is_ours(path: PurePosixPath) -> bool:
     return not is_temporary(path) and ".." not in path.parts  # which would lead out of a folder of this machine
-
-
-def _without_secrets(message: str) -> str:
-    """A message in which URLs have lost a user name and a password."""
-    return re.sub(r"://[^/@\s]*@", "://", message)

@@ -9,6 +9,8 @@ from PIL import Image
 from stable_baselines3.common.logger import HParam, Logger, TensorBoardOutputFormat, configure
 from tensorboard.compat.proto.summary_pb2 import Summary
 
+from tint_sumo.redaction import redact
+
 FOLDER = "tensorboard"
 _HYPERPARAMETERS = "hyperparameters"
 
@@ -34,7 +36,7 @@ def _flat(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]
         if isinstance(value, Mapping):
             yield from _flat(value, f"{prefix}{name}.")
         else:
-            yield f"{prefix}{name}", value if isinstance(value, bool | int | float | str) else str(value)
+            yield f"{prefix}{name}", value if isinstance(value, bool | int | float) else redact(str(value))
 
 
 def log_film(logger: Logger, name: str, gif: bytes, step: int) -> None:

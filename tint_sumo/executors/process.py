@@ -12,6 +12,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.executors.jobs import Ended, Job
 from tint_sumo.processes import interrupt_on_sigterm, start_worker, told
 from tint_sumo.progress import Progress
+from tint_sumo.redaction import redact
 from tint_sumo.stores import Store
 
 REPORT_INTERVAL_S = 0.2  # at most so often a job tells where it stands
@@ -34,7 +35,7 @@ def read_log(out: str | Path, name: str) -> str:
     logs = store.files(LOGS)
     if path not in logs:
         known = f"known are {', '.join(Path(log).stem for log in logs)}" if logs else "no job has run there"
-        raise InputError(f"no log of a job {name} in {out}; {known}")
+        raise InputError(f"no log of a job {name} in {redact(str(out))}; {known}")
     return store.read(path).decode("utf-8", errors="replace")
 
 

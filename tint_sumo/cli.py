@@ -36,7 +36,7 @@ from tint_sumo.processes import end_quickly, interrupt_on_sigterm
 from tint_sumo.provenance import Origin, made_by
 from tint_sumo.redaction import redact
 from tint_sumo.stores import name_in, working_folder
-from tint_sumo.structures import Where
+from tint_sumo.structures import Many, Where
 
 if TYPE_CHECKING:
     from tint_sumo.config import Share
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 # What a command needs is imported when it runs: --help shall not wait for torch and SUMO.
 # ruff: noqa: PLC0415
 
-ShareFlag = tuple[float, ...]  # one probability, or the two ends of a range
+ShareFlag = Many[float]  # one probability, or the two ends of a range
 _SCENES = ", ".join(ENV_IDS)
 Shell = Literal["bash", "zsh", "tcsh"]
 _TYRO = (OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff)
@@ -125,11 +125,11 @@ def _scene_in_full(value: Any) -> Any:
 
 
 def _read_population(value: Any, where: Where) -> Any:
-    from tint_sumo.config import Population, population_name
+    from tint_sumo.config import population_name, read_population
 
     if value is None:
         return None
-    population = Population.from_file(value, where)
+    population = read_population(value, where)
     return population_name(population) or population
 
 
@@ -542,14 +542,14 @@ class SweepPolicy(SpreadCommand):
 
     after_interrupt: ClassVar[str] = RESUMES
 
-    set: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE,VALUE [NAME=VALUE,VALUE ...]")]
+    set: Annotated[Many[str], arg(metavar="NAME=VALUE,VALUE [NAME=VALUE,VALUE ...]")]
     """Values of PPO's settings, all behind one --set, such as learning_rate=0.001,0.003 n_epochs=2,4; names of the
     network's settings begin with policy, such as policy.hidden_size=32,64."""
     out: FolderOrUrl
     """Folder of the sweep, or a URL such as s3://bucket/folder."""
-    methods: tuple[str, ...] = ("oracle",)
+    methods: Many[str] = ("oracle",)
     """Learned methods: no_labels, morton, vae, no_attention, cross_window, streaming, streaming_critic, ma, oracle."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: Many[int] = (0,)
     """Seeds of the trainings, 0 to 1000."""
     p_conservative: ShareFlag = (0.1, 0.9)
     """Probability in training that a driver is conservative, 0 to 1; two numbers: each episode draws its own between

@@ -7,10 +7,10 @@ Sources: "paper" is Liu et al., Learning to Navigate Intersections with Unsuperv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from tint_sumo.errors import InputError, find_named
-from tint_sumo.structures import FieldError, Where, build, choose
+from tint_sumo.structures import FieldError, Many, ReadBy, Where, build, choose
 
 NO_LEADER_GAP_M = 20.0  # stands for the gap of every driver without a leader, whatever its trait, and caps all gaps
 MIN_WINDOW_STEPS = 2  # shortest window; a single step has no motion
@@ -135,7 +135,7 @@ class Idm:
 class Population:
     """The vTypes drivers are drawn from."""
 
-    profiles: tuple[DriverProfile, ...] = DRIVER_PROFILES
+    profiles: Many[DriverProfile] = DRIVER_PROFILES
     members: int = 32  # vTypes of a profile of weight 1, each with its own draws
     seed: int = 2022  # seed of the draws
     idm: Idm = Idm()
@@ -149,24 +149,27 @@ class Population:
         require_at_least(self, 1, "members")
         require_at_least(self, 0, "seed")
 
-    @classmethod
-    def from_file(cls, value: Any, where: Where = ()) -> "Population":
-        """What a file means by a population: a name, a list of profiles, or what differs from its ``base``.
-
-        Raises:
-            FieldError: a value does not fit.
-        """
-        if not isinstance(value, list):
-            chosen = choose(value, POPULATIONS, "traits", where)
-            return POPULATIONS[chosen] if isinstance(chosen, str) else chosen
-        profiles = build(tuple[DriverProfile, ...], value, where)
-        try:
-            return cls(profiles)
-        except InputError as error:
-            raise FieldError(where, str(error)) from None
-
 
 POPULATIONS = {"traits": Population(), "continuous": Population((CONTINUOUS,), members=512)}
+
+
+def read_population(value: Any, where: Where = ()) -> Population:
+    """What a file means by a population: a name, a list of profiles, or what differs from its ``base``.
+
+    Raises:
+        FieldError: there is no such population, or a value does not fit.
+    """
+    if not isinstance(value, list):
+        chosen = choose(value, POPULATIONS, "traits", where)
+        return POPULATIONS[chosen] if isinstance(chosen, str) else chosen
+    profiles = build(tuple[DriverProfile, ...], value, where)
+    try:
+        return Population(profiles)
+    except InputError as error:
+        raise FieldError(where, str(error)) from None
+
+
+PopulationSetting = Annotated[Population, ReadBy(read_population)]
 
 
 def find_population(name: str) -> Population:
@@ -240,7 +243,7 @@ class Traffic:
 class EgoController:
     """The ego's low-level control (code): a PD law on speed, and a safety check that overrides it."""
 
-    desired_speeds_mps: tuple[float, ...] = (0.0, 0.5, 3.0)  # the actions (paper III-C)
+    desired_speeds_mps: Many[float] = (0.0, 0.5, 3.0)  # the actions (paper III-C)
     gain_per_s: float = 2.0
     accel_limit_mps2: float = 3.0
     unsafe_distance_m: float = 0.8  # distance between vehicle boxes
@@ -302,7 +305,7 @@ REWARD_PRESETS = {
 class TraitSettings:
     """The paper's trait network and its training; every trait method takes what it needs of it."""
 
-    embedding_sizes: tuple[int, ...] = (32, 64)  # code; () feeds the features to the GRU as they are
+    embedding_sizes: Many[int] = (32, 64)  # code; () feeds the features to the GRU as they are
     hidden_size: int = 256  # code
     encoder_output_size: int = 256  # code
     decoder_output_size: int = 128  # code
@@ -325,12 +328,12 @@ class TraitSettings:
 class PolicySettings:
     """The paper's policy network."""
 
-    embedding_sizes: tuple[int, ...] = (150, 100)  # code
-    score_sizes: tuple[int, ...] = (100, 100)  # code
+    embedding_sizes: Many[int] = (150, 100)  # code
+    score_sizes: Many[int] = (100, 100)  # code
     context_size: int = 50  # code
-    joint_sizes: tuple[int, ...] = (150, 100, 64)  # code
+    joint_sizes: Many[int] = (150, 100, 64)  # code
     hidden_size: int = 256  # code
-    head_sizes: tuple[int, ...] = (256, 256)  # code
+    head_sizes: Many[int] = (256, 256)  # code
     attention: bool = True  # without it, all vehicles count the same (the paper's ablation, IV-D)
     position_gain: float = 1.0  # positions are multiplied by this; observed in units of 20 m, they differ by little
 

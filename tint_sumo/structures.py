@@ -1,14 +1,23 @@
-"""Dataclasses from what a file says, and back. The types, defaults and checks are those of the dataclasses."""
+"""Dataclasses from what a file says, and back. Pydantic checks the types; its errors become one clear line each."""
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass, replace
+import json
+import reprlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tint_sumo.errors import InputError
+from tint_sumo.ranges import Range
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+# Pydantic is imported when a file is read: --help shall not wait for it.
+# ruff: noqa: PLC0415
 
 T = TypeVar("T")
 Where = tuple[str | int, ...]  # leads to a value: names of fields, and numbers of list items from 0
@@ -20,7 +29,12 @@ _WORDS = {
     str: "text",
     Path: "a path",
     NoneType: "null",
+    dict: "a mapping",
+    Any: "anything",
 }
+_SHOWN = reprlib.Repr()
+_SHOWN.maxstring = _SHOWN.maxother = 80
+_MOST_OTHERS = 5  # further errors that a message names
 
 
 class FieldError(InputError):
@@ -29,6 +43,7 @@ class FieldError(InputError):
     def __init__(self, where: Where, problem: str) -> None:
         super().__init__(f"{dotted(where)}: {problem}" if where else problem)
         self.where = where
+        self.problem = problem
 
 
 def dotted(where: Where) -> str:
@@ -36,38 +51,90 @@ def dotted(where: Where) -> str:
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where).removeprefix(".")
 
 
-def build(kind: Any, value: Any, where: Where = ()) -> Any:
-    """What a file says, as a value of a type: a dataclass, a tuple, a union, a literal, or a plain type.
+@dataclass(frozen=True)
+class ReadBy:
+    """Of a type that a file can give in a form of its own; beside the type, as ``Annotated[Scene, ReadBy(find)]``."""
 
-    A dataclass may have a class method ``from_file(value, where)`` that makes it of what a file says instead.
+    read: Callable[[Any], Any]  # makes the value of what the file gives; raises FieldError
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_plain_validator_function(self.read)
+
+
+class OneOrMany:
+    """Of a tuple of any length: a file may give its only item without a list."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        def read(value: Any) -> Any:
+            if isinstance(value, list):
+                return build(source, value)
+            try:
+                return build(source, [value])
+            except FieldError:
+                raise FieldError((), f"must be {_words(source)}, not {_shown(value)}") from None
+
+        return ReadBy(read).__get_pydantic_core_schema__(source, handler)
+
+
+Many = Annotated[tuple[T, ...], OneOrMany()]
+
+
+def build(kind: Any, value: Any, where: Where = ()) -> Any:
+    """Return what a file says as a value of a type: a dataclass, a tuple, a union, a literal, or a plain type.
+
+    Args:
+        kind: the type.
+        value: of what JSON and YAML know: null, true, numbers, text, lists and mappings.
+        where: the way to the value in its file, for messages.
 
     Raises:
         FieldError: the value does not fit the type.
     """
-    if get_origin(kind) is Annotated:
-        kind = get_args(kind)[0]
-    if hasattr(kind, "from_file"):
-        return kind.from_file(value, where)
-    if is_dataclass(kind):
-        return _build_dataclass(kind, None, value, where)
-    if get_origin(kind) in (Union, UnionType):
-        fitting = [one for one in get_args(kind) if _has_shape(one, value)]
-        return build(fitting[0], value, where) if fitting else _refuse(kind, value, where)
-    if not _has_shape(kind, value):
-        _refuse(kind, value, where)
-    if get_origin(kind) is tuple:
-        return tuple(build(one, part, (*where, at)) for at, (one, part) in enumerate(_items(kind, value, where)))
-    return value if kind is NoneType or get_origin(kind) is Literal else kind(value)
+    return build_json(kind, json.dumps(plain(value)).encode(), where)
+
+
+def build_json(kind: Any, text: bytes, where: Where = ()) -> Any:
+    """Return what a text in JSON says as a value of a type.
+
+    Raises:
+        FieldError: the text is not JSON, or the value does not fit the type.
+    """
+    from pydantic import ValidationError
+
+    try:
+        return _adapter(kind).validate_json(b"[" + text + b"]")[0]
+    except ValidationError as error:
+        raise _field_error(kind, error.errors(include_url=False), where) from None
+
+
+@cache
+def _adapter(kind: Any) -> "TypeAdapter[Any]":
+    from pydantic import ConfigDict, TypeAdapter
+
+    config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    return TypeAdapter(tuple[kind], config=config)  # a dataclass itself takes no settings, but inherits a tuple's
 
 
 def overlay(base: T, value: Any, where: Where = ()) -> T:
-    """A dataclass with the values that a file gives in place of its own, at any depth.
+    """Return a dataclass with the values that a file gives in place of its present ones, at any depth.
 
     Raises:
         FieldError: there is no such field, or a value does not fit its type.
     """
-    built: T = _build_dataclass(type(base), base, value, where)
+    built: T = build(type(base), _merged(base, value), where)
     return built
+
+
+def _merged(base: Any, value: Any) -> Any:
+    """What a file says of a dataclass, and what the dataclass says where the file is silent."""
+    if not isinstance(value, Mapping):
+        return value
+    hints = get_type_hints(type(base), include_extras=True)
+    present = {field.name: getattr(base, field.name) for field in fields(base) if field.init}
+    parts = [name for name in value if is_dataclass(present.get(name)) and get_origin(hints[name]) is not Annotated]
+    return {**present, **value, **{name: _merged(present[name], value[name]) for name in parts}}
 
 
 def choose(value: Any, named: Mapping[str, T], default: str, where: Where = ()) -> str | T:
@@ -93,7 +160,7 @@ def is_mapping(value: Any, named: Mapping[str, Any], where: Where) -> bool:
         FieldError: it gives neither.
     """
     if not isinstance(value, str | Mapping):
-        raise FieldError(where, f"must be a name ({', '.join(named)}) or a mapping of settings, not {value!r}")
+        raise FieldError(where, f"must be a name ({', '.join(named)}) or a mapping of settings, not {_shown(value)}")
     return isinstance(value, Mapping)
 
 
@@ -113,8 +180,8 @@ def require_known(name: Any, known: Mapping[str, Any] | Sequence[str], where: Wh
         FieldError: it is not.
     """
     if not isinstance(name, str) or name not in known:
-        known_names = ", ".join(known)
-        raise FieldError(where, f"is not known: {name!r}{_nearest(str(name), known)}; choose one of: {known_names}")
+        nearest, known_names = _nearest(str(name), known), ", ".join(known)
+        raise FieldError(where, f"is not known: {_shown(name)}{nearest}; choose one of: {known_names}")
     return name
 
 
@@ -122,8 +189,7 @@ def require_fields(value: Mapping[Any, Any], known: Mapping[str, Any], where: Wh
     """Raise FieldError if a mapping has other keys than the known ones."""
     for key in value:
         if key not in known:
-            nearest = _nearest(str(key), known)
-            raise FieldError((*where, str(key)), f"there is no such setting{nearest}; known are {', '.join(known)}")
+            raise FieldError((*where, str(key)), _unknown(str(key), list(known)))
 
 
 def plain(value: Any) -> Any:
@@ -137,47 +203,81 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _build_dataclass(kind: Any, base: Any, value: Any, where: Where) -> Any:
-    if not isinstance(value, Mapping):
-        _refuse(kind, value, where)
-    hints = get_type_hints(kind, include_extras=True)
-    known = {field.name: field for field in fields(kind) if field.init}
-    require_fields(value, known, where)
-    given = {key: _build_field(hints[key], getattr(base, key, None), one, (*where, key)) for key, one in value.items()}
-    missing = [name for name, field in known.items() if name not in given and is_required(field)]
-    if base is None and missing:
-        raise FieldError(where, f"{', '.join(missing)} must be given")
-    try:
-        return kind(**given) if base is None else replace(base, **given)
-    except InputError as error:
-        raise FieldError(where, str(error)) from None
-
-
-def _build_field(kind: Any, present: Any, value: Any, where: Where) -> Any:
-    """A field's new value; a mapping changes the dataclass that is there."""
-    if isinstance(value, Mapping) and is_dataclass(present) and not hasattr(kind, "from_file"):
-        return overlay(present, value, where)
-    return build(kind, value, where)
-
-
 def is_required(field: Any) -> bool:
     """Whether a dataclass's field has no default."""
     return field.default is MISSING and field.default_factory is MISSING
 
 
-def _has_shape(kind: Any, value: Any) -> bool:
-    """Whether a value may fit a type, as far as can be seen without looking into it."""
+# Pydantic's errors as one line
+
+
+def _field_error(kind: Any, errors: Iterable[Mapping[str, Any]], where: Where) -> FieldError:
+    """The first error in full, and where others are."""
+    found: dict[Where, str] = {}
+    of_unions: dict[Where, str] = {}  # pydantic tries each member of a union; the value may have the shape of none
+    missing: dict[Where, list[str]] = {}
+    for error in errors:
+        place, expected, union = _find(kind, error["loc"][1:])
+        problem = error.get("ctx", {}).get("error")
+        if error["type"] == "missing" and place and isinstance(place[-1], str):
+            missing.setdefault(place[:-1], []).append(place[-1])
+        elif error["type"] == "unexpected_keyword_argument":
+            found.setdefault(place, _unknown(str(place[-1]), _names(_find(kind, error["loc"][1:-1])[1])))
+        elif isinstance(problem, FieldError):
+            found.setdefault((*place, *problem.where), problem.problem)
+        elif error["type"] in ("value_error", "json_invalid"):
+            found.setdefault(place, str(problem))
+        else:
+            if error["type"] == "missing":  # a tuple is too short
+                place, expected, union = _find(kind, error["loc"][1:-1])
+            text = f"must be {_words(expected)}, not {_shown(error['input'])}"
+            (of_unions if place == union else found).setdefault(place, text)
+    found |= {place: f"{', '.join(names)} must be given" for place, names in missing.items()}
+    found |= {at: text for at, text in of_unions.items() if not any(one[: len(at)] == at for one in found)}
+    (first, problem), *others = found.items()
+    also = ", ".join(dotted((*where, *place)) for place, _ in others[:_MOST_OTHERS])
+    return FieldError((*where, *first), problem + (f"; also wrong: {also}" if also else ""))
+
+
+def _find(kind: Any, location: Sequence[str | int]) -> tuple[Where, Any, Where | None]:
+    """Where pydantic's location is, which type the value there should have, and where the last union on the way is."""
+    where: Where = ()
+    union = None
+    parts = list(location)
+    while parts:
+        members = _members(kind)
+        if len(members) > 1:  # this part is the name of the member that was tried
+            union = where
+            parts.pop(0)
+            if parts:
+                kind = next((one for one in members if _has_parts(one, parts[0])), None)
+            continue
+        where = (*where, parts[0])
+        kind = _part(members[0], parts.pop(0))
+    return where, kind, union
+
+
+def _members(kind: Any) -> list[Any]:
+    """The types of a union, without what they are annotated with and without null; a type itself is its only one."""
+    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+    if get_origin(kind) not in (Union, UnionType):
+        return [kind]
+    return [member for one in get_args(kind) if one is not NoneType for member in _members(one)]
+
+
+def _has_parts(kind: Any, part: str | int) -> bool:
+    """Whether values of a type have items with numbers, or with names."""
+    return (get_origin(kind) is tuple) is isinstance(part, int)
+
+
+def _part(kind: Any, part: str | int) -> Any:
+    """The type of a part of a value of this type; None if it has no such part."""
     if is_dataclass(kind):
-        return isinstance(value, Mapping)
-    if get_origin(kind) is tuple:
-        return isinstance(value, list | tuple) or (_is_variadic(kind) and _has_shape(get_args(kind)[0], value))
-    if get_origin(kind) is Literal:
-        return value in get_args(kind) and not isinstance(value, bool)
-    if isinstance(value, bool):
-        return kind is bool
-    if kind is float:
-        return isinstance(value, int | float) and math.isfinite(value)
-    return isinstance(value, str | Path if kind is Path else kind)
+        return get_type_hints(kind, include_extras=True).get(str(part))
+    kinds = get_args(kind)
+    if get_origin(kind) is not tuple:
+        return kinds[-1] if kinds else None
+    return kinds[0] if _is_variadic(kind) else next(iter(kinds[int(part) :]), None)
 
 
 def _is_variadic(kind: Any) -> bool:
@@ -185,35 +285,38 @@ def _is_variadic(kind: Any) -> bool:
     return get_args(kind)[-1] is ...
 
 
-def _items(kind: Any, value: Any, where: Where) -> list[tuple[Any, Any]]:
-    """The items of a tuple, each with its type; where there may be any number of them, one needs no list."""
-    kinds = get_args(kind)
-    if _is_variadic(kind):
-        return [(kinds[0], one) for one in (value if isinstance(value, list | tuple) else [value])]
-    if len(value) != len(kinds):
-        _refuse(kind, value, where)
-    return list(zip(kinds, value, strict=True))
-
-
-def _refuse(kind: Any, value: Any, where: Where) -> Any:
-    raise FieldError(where, f"must be {_words(kind)}, not {value!r}")
+def _names(kind: Any) -> list[str]:
+    """The fields of a dataclass that a file can give, also of one among other types."""
+    return [field.name for one in _members(kind) if is_dataclass(one) for field in fields(one) if field.init]
 
 
 def _words(kind: Any) -> str:
     """What a type allows."""
     arguments = get_args(kind)
+    if get_origin(kind) is Annotated:
+        limits = [str(one) for one in arguments[1:] if isinstance(one, Range)]
+        return " ".join([_words(arguments[0]), *limits])
     if is_dataclass(kind):
-        return f"a mapping of {', '.join(field.name for field in fields(kind))}"
+        return f"a mapping of {', '.join(_names(kind))}"
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(str, arguments))}"
     if get_origin(kind) is tuple:
         count = "" if _is_variadic(kind) else f" of {len(arguments)}"
         return f"a list{count}, each item {_words(arguments[0])}"
-    if arguments:
+    if get_origin(kind) in (Union, UnionType):
         return " or ".join(map(_words, arguments))
-    return _WORDS[kind]
+    return _WORDS[get_origin(kind) or kind]
+
+
+def _unknown(name: str, known: Sequence[str]) -> str:
+    return f"there is no such setting{_nearest(name, known)}; known are {', '.join(known)}"
 
 
 def _nearest(name: str, known: Mapping[str, Any] | Sequence[str]) -> str:
     found = get_close_matches(name.replace("-", "_"), list(known), n=1)
     return f"; did you mean {found[0]}?" if found else ""
+
+
+def _shown(value: Any) -> str:
+    """A value for people, no longer than a line."""
+    return _SHOWN.repr(value)

@@ -21,7 +21,7 @@ _WIDTH = 116  # width of comments and lists
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.1, but 1e-3 is a number, as everybody expects."""
+    """YAML 1.1 with the types of JSON alone: a date is text. 1e-3 is a number, as everybody expects."""
 
 
 class _Dumper(yaml.SafeDumper):
@@ -32,6 +32,14 @@ for _one in (_Loader, _Dumper):
     _one.add_implicit_resolver(
         "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
     )
+
+
+_OTHERS = tuple(f"tag:yaml.org,2002:{name}" for name in ("timestamp", "binary", "set", "omap", "pairs"))
+_Loader.yaml_constructors = {tag: one for tag, one in _Loader.yaml_constructors.items() if tag not in _OTHERS}
+_Loader.yaml_implicit_resolvers = {
+    first: [one for one in resolvers if one[0] not in _OTHERS]
+    for first, resolvers in _Loader.yaml_implicit_resolvers.items()
+}
 
 
 @dataclass(frozen=True)

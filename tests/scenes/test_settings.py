@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.scenes.own_networks import OwnNetwork
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DRIVER_PROFILES, POPULATIONS, Population
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DRIVER_PROFILES, POPULATIONS, Population, read_population
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import (
     ALL_SCENES,
@@ -95,11 +95,11 @@ def test_a_sumo_configuration(own_network: Callable[[str], OwnNetwork]) -> None:
 
 
 def test_populations() -> None:
-    assert Population.from_file("continuous") == POPULATIONS["continuous"]
-    assert Population.from_file({"base": "continuous", "members": 8}) == replace(POPULATIONS["continuous"], members=8)
-    assert Population.from_file({"idm": {"tau_s": 2}}).profiles == DRIVER_PROFILES
-    assert [profile.name for profile in Population.from_file([SHY]).profiles] == ["shy"]
-    assert Population.from_file(plain(POPULATIONS["traits"])) == POPULATIONS["traits"]
+    assert read_population("continuous") == POPULATIONS["continuous"]
+    assert read_population({"base": "continuous", "members": 8}) == replace(POPULATIONS["continuous"], members=8)
+    assert read_population({"idm": {"tau_s": 2}}).profiles == DRIVER_PROFILES
+    assert [profile.name for profile in read_population([SHY]).profiles] == ["shy"]
+    assert read_population(plain(POPULATIONS["traits"])) == POPULATIONS["traits"]
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_populations() -> None:
 )
 def test_wrong_profiles(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        Population.from_file([{**SHY, **wrong}], ("population",))
+        read_population([{**SHY, **wrong}], ("population",))
 
 
 def test_wrong_populations() -> None:
@@ -130,5 +130,5 @@ def test_wrong_populations() -> None:
         with pytest.raises(InputError, match=message):
             Population(profiles)
     with pytest.raises(InputError, match="population: profiles must have names of their own, not shy, shy"):
-        Population.from_file([SHY, SHY], ("population",))
+        read_population([SHY, SHY], ("population",))
     assert Population((AGGRESSIVE,)).profiles == (AGGRESSIVE,)

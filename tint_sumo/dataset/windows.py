@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, WINDOW_STEPS, Population
+from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, WINDOW_STEPS, Population, read_population
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, SCHEMA_VERSION, TRAJECTORIES, read_shards
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
@@ -178,7 +178,7 @@ def own_vtypes(manifest: Mapping[str, Any]) -> list[str] | None:
 
 def drivers_of(manifest: Mapping[str, Any]) -> Population:
     """The population of a dataset of a scene."""
-    return Population.from_file(manifest["population"], ("population",))
+    return read_population(manifest["population"], ("population",))
 
 
 def load_drivers(folder: Path, windows: OfDrivers, columns: Sequence[str]) -> pd.DataFrame:

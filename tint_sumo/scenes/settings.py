@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
-from tint_sumo.config import Claim, EgoController, Population, VehicleShape
+from tint_sumo.config import Claim, EgoController, PopulationSetting, VehicleShape
 from tint_sumo.errors import InputError
 from tint_sumo.scenes.own import OwnScene, from_sumocfg
 from tint_sumo.scenes.scene import ALL_SCENES, SCENES, T_INTERSECTION, Scene, digest_of, find_scene
-from tint_sumo.structures import FieldError, Where, build, is_mapping, overlay, plain, require_base, require_known
+from tint_sumo.structures import FieldError, Many, Where, build, is_mapping, overlay, plain, require_base, require_known
 
 AnyScene = str | Scene | OwnScene
 
@@ -32,7 +32,7 @@ class SceneSettings:
     """How the ego drives; its desired speeds are the actions."""
     claim: Claim
     """When the ego claims a lane, and who reacts to that."""
-    population: Population
+    population: PopulationSetting
     """Who drives: traits, continuous, a list of profiles, or a mapping of what differs from them."""
     arrivals_per_s: float | None
     """Rate of drivers who come on each route; null: as many as there is room for."""
@@ -90,7 +90,7 @@ class OwnSceneSettings:
 
     sumocfg: Path
     """SUMO configuration; its step length is the scene's."""
-    ego_route: tuple[str, ...]
+    ego_route: Many[str]
     """Edges that the ego drives along, one after the other."""
     start_m: float
     """Where on its route the ego's front is at the beginning; not on a junction."""

@@ -16,6 +16,7 @@ from tint_sumo.config import (
     set_floats,
 )
 from tint_sumo.errors import InputError
+from tint_sumo.structures import Many
 
 ALL_MIXES: Share = (0.1, 0.9)  # P(conservative) is drawn from this range in every episode
 SNAPSHOTS_PERCENT = (25, 50)  # parts of a training after which the policy is kept, too
@@ -74,7 +75,7 @@ class Conditions:
 class Trials:
     """Some conditions, each with so many cases, which are the same for all policies."""
 
-    conditions: tuple[Conditions, ...]
+    conditions: Many[Conditions]
     episodes: int
 
     def __post_init__(self) -> None:
@@ -93,10 +94,10 @@ class Budget:
     windows: int = 0  # windows to record for them
     record_p_conservative: float = 0.5  # share of conservative drivers in the dataset
     ppo: PpoSettings = field(default_factory=PpoSettings)  # settings of PPO, and the steps of every policy
-    methods: tuple[str, ...] = ("always_go", "ttc", "no_labels", "vae", "oracle")
-    mixes: tuple[Share, ...] = (ALL_MIXES,)  # P(conservative) in training: a policy for each
-    seeds: tuple[int, ...] = (0, 1, 2)
-    trials: tuple[Trials, ...] = ()
+    methods: Many[str] = ("always_go", "ttc", "no_labels", "vae", "oracle")
+    mixes: Many[Share] = (ALL_MIXES,)  # P(conservative) in training: a policy for each
+    seeds: Many[int] = (0, 1, 2)
+    trials: Many[Trials] = ()
     with_shipped: bool = False  # test the shipped policies, too
 
     def __post_init__(self) -> None:

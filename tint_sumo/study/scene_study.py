@@ -19,6 +19,7 @@ from tint_sumo.files import claim_folder, read_json, write_json, write_text
 from tint_sumo.progress import Report
 from tint_sumo.scenes import SCENES, T_INTERSECTION
 from tint_sumo.standings import Title
+from tint_sumo.structures import Many
 from tint_sumo.study.budgets import TRAIT_BUDGETS
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.tables import markdown_table
@@ -35,11 +36,11 @@ class SceneStudy:
     """What is recorded, and which trait models are trained and tested on it."""
 
     windows: int = 60_000  # windows of each scene and population
-    methods: tuple[str, ...] = ("vae", "cross_window", "morton", "classifier")
+    methods: Many[str] = ("vae", "cross_window", "morton", "classifier")
     settings: TraitSettings = field(default_factory=lambda: replace(TRAIT_BUDGETS["full"], epochs=10))
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: Many[int] = (0, 1, 2)
     noise_m: float = 0.0
-    scenes: tuple[str, ...] = tuple(SCENES)
+    scenes: Many[str] = tuple(SCENES)
     recording_seed: int = 77  # seed of the first scene; no dataset of a shipped model has it
 
 

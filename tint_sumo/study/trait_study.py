@@ -15,6 +15,7 @@ from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import claim_folder, write_json
 from tint_sumo.progress import Report, part_of
 from tint_sumo.standings import Title
+from tint_sumo.structures import Many
 from tint_sumo.study.budgets import TRAIT_BUDGETS
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.trait_models import train_on_split
@@ -34,16 +35,16 @@ class TraitStudy:
 
     windows: int = 696_000  # paper IV-B
     settings: TraitSettings = TRAIT_BUDGETS["full"]
-    methods: tuple[str, ...] = ("vae", "cross_window", "morton", "classifier")
-    noises_m: tuple[float, ...] = (0.0, 0.05, 0.1, 0.2)
-    seeds: tuple[int, ...] = (0, 1, 2)
+    methods: Many[str] = ("vae", "cross_window", "morton", "classifier")
+    noises_m: Many[float] = (0.0, 0.05, 0.1, 0.2)
+    seeds: Many[int] = (0, 1, 2)
     p_conservative: float = 0.5  # mix of the training data
-    other_p: tuple[float, ...] = (0.25, 0.4, 0.6)  # mixes of further test data
+    other_p: Many[float] = (0.25, 0.4, 0.6)  # mixes of further test data
     other_windows: int = 30_000
     continuous_windows: int = 240_000
-    continuous_methods: tuple[str, ...] = ("vae", "cross_window")
-    continuous_latents: tuple[int, ...] = (2, 4)
-    continuous_seeds: tuple[int, ...] = (0, 1)
+    continuous_methods: Many[str] = ("vae", "cross_window")
+    continuous_latents: Many[int] = (2, 4)
+    continuous_seeds: Many[int] = (0, 1)
     continuous_epochs: int = 10  # properties without classes take longer to show
 
 

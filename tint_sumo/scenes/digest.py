@@ -42,7 +42,7 @@ _LISTED: Mapping[str, tuple[str, ...]] = {
         "braking_mps2",
     ),
 }
-_Route = namedtuple("Route", _LISTED["Route"])  # version 1 writes routes by their name, and other parts as mappings
+Route = namedtuple("Route", ["name", "edges"])  # version 1 writes routes by their name, and other parts as mappings
 
 
 def scene_digest(scene: Any) -> str:
@@ -61,7 +61,7 @@ def _plain(value: Any) -> Any:
     if kind is None:
         return value
     values = _values(value, kind)
-    return _Route(**values) if kind == "Route" else values
+    return Route(**values) if kind == "Route" else values
 
 
 def _values(owner: Any, kind: str) -> dict[str, Any]:

@@ -89,8 +89,8 @@ def test_importing_the_package_loads_no_more_than_gymnasium() -> None:
 
 def test_floors_import_downwards_only() -> None:
     floors = [
-        "changes compiling config errors executors files job_table processes progress provenance ranges standings "
-        "stores structures timing training_log yaml_files",
+        "changes compiling config errors executors files job_table processes progress provenance ranges redaction "
+        "standings stores structures timing training_log yaml_files",
         "scenes",
         "simulation",
         "envs dataset",

@@ -2,11 +2,17 @@ import gc
 import os
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
 
+import libsumo
 import pytest
 
+from tests.scenes.own_networks import OwnNetwork
 from tests.simulation.scenes import T
 from tint_sumo.errors import InputError
+from tint_sumo.simulation.own import OwnSimulation, sumo_options
 from tint_sumo.simulation.simulation import Simulation
 
 
@@ -27,6 +33,91 @@ def test_traci_when_asked_for() -> None:
     simulation = Simulation(1, T, backend="traci")
     assert simulation.backend == "traci"
     simulation.close()
+
+
+@pytest.fixture
+def start_as_user(own_network: Callable[[str], OwnNetwork]) -> Iterator[Callable[[], None]]:
+    """Start a simulation in libsumo as the user's own program does, and step it once."""
+
+    def start() -> None:
+        libsumo.start(["sumo", *sumo_options(own_network("merge").scene().config, seed=5)])
+        libsumo.simulationStep(10.0)
+
+    yield start
+    if libsumo.isLoaded():
+        libsumo.close()
+
+
+def test_where_the_user_runs_libsumo_simulations_take_traci(start_as_user: Callable[[], None]) -> None:
+    start_as_user()
+    with pytest.raises(InputError, match="libsumo already runs a simulation in this process"):
+        Simulation(1, T, backend="libsumo")
+    simulation = Simulation(1, T)
+    assert simulation.backend == "traci"
+    simulation.reset(0, 0)
+    simulation.close()
+    assert libsumo.simulation.getTime() == 10.0
+
+
+def test_closing_never_ends_a_simulation_that_the_user_started_later(
+    start_as_user: Callable[[], None], own_network: Callable[[str], OwnNetwork]
+) -> None:
+    closed = Simulation(1, T)
+    closed.close()
+    start_as_user()
+    closed.close()
+    del closed
+    libsumo.close()
+    for make in (lambda: Simulation(1, T), lambda: OwnSimulation(own_network("merge").scene())):
+        running = make()
+        assert running.backend == "libsumo"
+        start_as_user()  # libsumo ends the one that runs
+        running.close()
+        assert libsumo.simulation.getTime() == 10.0
+        libsumo.close()
+
+
+def test_libsumo_is_free_after_episodes_of_a_configuration(own_network: Callable[[str], OwnNetwork]) -> None:
+    simulation = OwnSimulation(own_network("merge").scene(warm_up_s=0.0), backend="libsumo")
+    simulation.reset(0, 1)
+    simulation.close()
+    assert not libsumo.isLoaded()
+
+
+def test_threads_claim_libsumo_once_and_keep_their_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    start = libsumo.start
+    monkeypatch.setattr(libsumo, "start", lambda command: (time.sleep(0.5), start(command)))  # lets the others go on
+    made: list[Simulation] = []
+    streams = sys.stdout, sys.stderr
+    threads = [threading.Thread(target=lambda: made.append(Simulation(1, T))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (sys.stdout, sys.stderr) == streams
+    assert sorted(simulation.backend for simulation in made) == ["libsumo", "traci", "traci", "traci"]
+    for simulation in made:
+        simulation.reset(0, 1)
+        simulation.close()
+
+
+def test_a_forked_process_leaves_the_simulations_of_its_parent_alone() -> None:
+    simulations = [Simulation(1, T), Simulation(1, T)]
+    for simulation in simulations:
+        simulation.reset(0, 1)
+    child = os.fork()
+    if child == 0:
+        try:
+            for simulation in simulations:
+                simulation.close()
+            again = Simulation(1, T)
+            os._exit(0 if again.backend == "libsumo" else 1)
+        finally:
+            os._exit(2)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    for simulation in simulations:
+        simulation.step()
+        simulation.close()
 
 
 def test_a_forgotten_simulation_gives_libsumo_free() -> None:

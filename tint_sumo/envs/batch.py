@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.envs.episodes import Episodes, TaskSettings
 from tint_sumo.envs.rendering import render_scene
-from tint_sumo.envs.rows import Rows, outcome_name
+from tint_sumo.envs.rows import STEP_FIELDS, Rows, outcome_name
 from tint_sumo.timing import StepPart, does
 
 
@@ -94,11 +94,12 @@ class LocalBatch:
         ended = [self._ended(index) for index in np.flatnonzero(self.rows["outcome"]).tolist()]
         for one in ended:
             self._begin(one.index)
+            self.rows[STEP_FIELDS][one.index] = one.row[STEP_FIELDS]
         return ended
 
     def park(self, mask: NDArray[np.bool_]) -> None:
         for index in np.flatnonzero(mask).tolist():
-            self.episodes.simulation.clear(index)
+            self.episodes.park(index)
 
     def snapshot(self) -> list[Snapshot]:
         taken = np.array(self._actions, np.int8).reshape(-1, len(self._began))

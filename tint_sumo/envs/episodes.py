@@ -117,23 +117,35 @@ class Episodes:
         self._scales = Scales(POSITION_SCALE_M, SPEED_SCALE_MPS, scene.step_s)
         self._speeds_mps = np.array(scene.ego.controller.desired_speeds_mps)
         self.steps = np.zeros(num_envs, np.int64)
+        self._parked: set[int] = set()
         self._noise: dict[int, np.random.Generator] = {}  # the generator of each environment, if there is noise
         self._noise_m: Floats = np.zeros((num_envs, scene.max_vehicles, 2))
 
     def begin(self, index: int, rng: np.random.Generator) -> None:
-        """Start a new episode drawn from an environment's generator."""
+        """Start a new episode drawn from an environment's generator; nothing is left of the one before."""
         seed = episode_seed(rng)
         self.simulation.reset(index, seed)
+        self._parked.discard(index)
+        self.rows[index] = np.zeros((), self.rows.dtype)
         self.steps[index] = 0
         if self.settings.position_noise_m > 0.0:
             self._noise[index] = np.random.default_rng([seed, 1])
         self._observe(slice(index, index + 1))
 
+    def park(self, index: int) -> None:
+        """Empty an environment, whose ego stands and whose time does not pass until its next episode begins."""
+        self.simulation.clear(index)
+        self._parked.add(index)
+
     @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> bool:
         """Take an action, the number of a desired speed, in each environment; (N,). Whether any episode has ended."""
         simulation = self.simulation
-        simulation.step(self._speeds_mps[actions])
+        desired_mps = self._speeds_mps[actions]
+        if self._parked:
+            parked = list(self._parked)
+            desired_mps[parked], self.steps[parked] = 0.0, -1
+        simulation.step(desired_mps)
         self.steps += 1
         self._observe(slice(0, len(self.steps)))
         egos = simulation.egos

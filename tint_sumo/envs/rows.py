@@ -17,6 +17,7 @@ OBSERVATION_KEYS = ("ego", "vehicles", "mask")
 TRACKS = ("position_m", "gap_m", "passed")  # per vehicle slot, if they are asked for
 REWARD_TERMS = ("goal", "collision", "speed", "step")
 OUTCOMES = ("success", "timeout", "collision")
+STEP_FIELDS = ["terminated", "truncated", "reward", *REWARD_TERMS]  # of a row: what the last step was worth
 _GOING_ON, _SUCCESS, _TIMEOUT, _COLLISION = range(4)  # numbers of outcomes in rows: positions in OUTCOMES, plus 1
 NOBODY = -1  # the trait of an empty slot
 BOUND = 2.0  # limit of normalised observations: 40 m, 6 m/s

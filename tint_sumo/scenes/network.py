@@ -8,6 +8,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import sumo
@@ -155,6 +156,7 @@ def sumo_program(program: str) -> str:
     return str(path)
 
 
+@lru_cache(maxsize=8)  # copies of an environment, and one that begins anew, need the same network again
 def build_network(sources: PlainXml) -> str:
     """Run netconvert on the sources and return the text of the network, without its dated header."""
     with tempfile.TemporaryDirectory() as folder:

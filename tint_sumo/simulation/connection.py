@@ -1,27 +1,32 @@
 """One way to talk to SUMO: ``libsumo`` in this process, or ``traci`` to a ``sumo`` subprocess.
 
 libsumo holds one simulation per process, so a second environment in the same process (Stable-Baselines3's
-``EvalCallback`` has one) gets a subprocess.
+``EvalCallback`` has one) gets a subprocess, and so does the first one where the user's own program runs libsumo.
 """
 
-import contextlib
-import io
 import os
 import subprocess
+import threading
+import time
+import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
 from typing import Any, Literal
 
 import libsumo
 from sumolib.miscutils import getFreeSocketPort
 from traci import main as traci  # with LIBSUMO_AS_TRACI the package itself is libsumo under another name
+from traci.exceptions import FatalTraCIError
 
 from tint_sumo.config import Backend
 from tint_sumo.errors import InputError
 from tint_sumo.scenes.network import sumo_program
 
 _CONNECT_TRIES, _CONNECT_WAIT_S = 600, 0.05  # sumo takes a moment to listen
-_libsumo_owner: list[int] = []  # process id of the one libsumo simulation; a forked child does not inherit the claim
+_SIMULATION_OPTIONS = ("--net-file", "--configuration-file", "--seed")  # these tell simulations apart
 
 
 @dataclass(frozen=True)
@@ -42,45 +47,89 @@ class Connection:
 def connect(options: Sequence[str], backend: Backend = "auto") -> Connection:
     """Start SUMO with command-line ``options`` (https://sumo.dlr.de/docs/sumo.html).
 
-    ``auto`` takes libsumo if it is free in this process and traci otherwise.
+    ``auto`` takes libsumo if it is free in this process and traci otherwise. A connection that nothing refers to any
+    more is closed.
 
     Raises:
         InputError: libsumo was asked for but already runs a simulation in this process, or the name is unknown.
     """
     if backend not in ("auto", "libsumo", "traci"):
         raise InputError(f"unknown backend {backend!r}; choose auto, libsumo or traci")
-    busy = not libsumo_is_free()
-    if backend == "libsumo" and busy:
+    if backend == "traci":
+        return _traci(options)
+    with _lock:
+        if libsumo_is_free():
+            return _libsumo(options)
+    if backend == "libsumo":
         raise InputError("libsumo already runs a simulation in this process; close it first or use backend='traci'")
-    return _traci(options) if backend == "traci" or busy else _libsumo(options)
+    return _traci(options)
+
+
+@dataclass(eq=False)
+class _Claim:
+    """The use of libsumo by one of our simulations."""
+
+    options: list[str]  # that it was started or loaded with last
+    process_id: int = field(default_factory=os.getpid)
+
+
+_lock = threading.RLock()  # reentrant: garbage collection may close a simulation while another one starts
+_claims: list[_Claim] = []  # at most one
 
 
 def libsumo_is_free() -> bool:
-    """Whether this process can start a simulation in libsumo."""
-    return os.getpid() not in _libsumo_owner
+    """Return whether this process can start a simulation in libsumo, which the user's own program may use, too.
+
+    A forked process has a copy of its parent's simulation, and may start another one in its place.
+    """
+    return not libsumo.isLoaded() or any(claim.process_id != os.getpid() for claim in _claims)
 
 
 def _libsumo(options: Sequence[str]) -> Connection:
-    libsumo.start(["sumo", *options])
-    _libsumo_owner[:] = [os.getpid()]
+    claim = _Claim(list(options))
+    _claims[:] = [claim]
+    try:
+        libsumo.start(["sumo", *options])
+        # The Python function that SWIG puts around it would take a third of a call's time.
+        lane_position_m = getattr(libsumo._libsumo, "vehicle_getLanePosition", libsumo.vehicle.getLanePosition)
+        return _closed_when_forgotten(
+            Connection(
+                "libsumo",
+                libsumo.vehicle,
+                libsumo.vehicletype,
+                libsumo.route,
+                libsumo.simulation,
+                lane_position_m,
+                libsumo.simulationStep,
+                partial(_load, claim),
+                partial(_release, claim),
+            )
+        )
+    except BaseException:
+        _release(claim)
+        raise
 
-    def close() -> None:
-        if not libsumo_is_free():
-            _libsumo_owner.clear()
-            libsumo.close()
 
-    # The Python function that SWIG puts around it would take a third of a call's time.
-    lane_position_m = getattr(libsumo._libsumo, "vehicle_getLanePosition", libsumo.vehicle.getLanePosition)
-    return Connection(
-        "libsumo",
-        libsumo.vehicle,
-        libsumo.vehicletype,
-        libsumo.route,
-        libsumo.simulation,
-        lane_position_m,
-        libsumo.simulationStep,
-        libsumo.load,
-        close,
+def _load(claim: _Claim, options: list[str]) -> None:
+    claim.options = options
+    libsumo.load(options)
+
+
+def _release(claim: _Claim) -> None:
+    """End the simulation of a claim, but none that somebody else has started since."""
+    with _lock:
+        if claim in _claims and claim.process_id == os.getpid():
+            if libsumo.isLoaded() and _runs(claim.options):
+                libsumo.close()
+            _claims.clear()
+
+
+def _runs(options: Sequence[str]) -> bool:
+    """Return whether libsumo runs the simulation that has these options."""
+    return all(
+        libsumo.simulation.getOption(name.removeprefix("--")) == value
+        for name, value in pairwise(options)
+        if name in _SIMULATION_OPTIONS
     )
 
 
@@ -88,17 +137,46 @@ def _traci(options: Sequence[str]) -> Connection:
     port = getFreeSocketPort()
     command = [sumo_program("sumo"), *options, "--remote-port", str(port)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    with contextlib.redirect_stdout(io.StringIO()):  # traci prints every try
-        connection = traci.connect(port, numRetries=_CONNECT_TRIES, proc=process, waitBetweenRetries=_CONNECT_WAIT_S)
-    connection.getVersion()  # sumo answers once it has loaded its input, whose files may then go
-    return Connection(
-        "traci",
-        connection.vehicle,
-        connection.vehicletype,
-        connection.route,
-        connection.simulation,
-        connection.vehicle.getLanePosition,
-        connection.simulationStep,
-        connection.load,
-        connection.close,
-    )
+    try:
+        connection = _reach(port, process)
+        connection.getVersion()  # sumo answers once it has loaded its input, whose files may then go
+        return _closed_when_forgotten(
+            Connection(
+                "traci",
+                connection.vehicle,
+                connection.vehicletype,
+                connection.route,
+                connection.simulation,
+                connection.vehicle.getLanePosition,
+                connection.simulationStep,
+                connection.load,
+                partial(_end, connection, process, os.getpid()),
+            )
+        )
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
+
+
+def _reach(port: int, process: "subprocess.Popen[bytes]") -> Any:
+    """Connect as soon as sumo listens; traci's own retries would be printed."""
+    for _ in range(_CONNECT_TRIES):
+        with suppress(FatalTraCIError):
+            return traci.connect(port, numRetries=0, proc=process)
+        time.sleep(_CONNECT_WAIT_S)
+    raise FatalTraCIError(f"sumo has not listened on port {port} for {_CONNECT_TRIES * _CONNECT_WAIT_S:g} s")
+
+
+def _end(connection: Any, process: "subprocess.Popen[bytes]", process_id: int) -> None:
+    """End sumo, which has nothing to save, whatever it is doing; only in the process that started it."""
+    if process_id == os.getpid():
+        process.kill()
+        process.wait()
+        with suppress(FatalTraCIError, OSError):  # sumo does not answer any more
+            connection.close(wait=False)
+
+
+def _closed_when_forgotten(connection: Connection) -> Connection:
+    weakref.finalize(connection, connection.close)
+    return connection

@@ -117,8 +117,11 @@ class Demand:
         return placed
 
     def stop(self, replica: int) -> None:
-        """No driver appears any more."""
+        """Let no driver appear any more."""
+        self._streams[replica] = ()
         self._wanted_gap_m[replica] = np.inf
+        self._wanted_time_s[replica] = 0.0
+        self._admitted[replica] = False
 
     def admit(self, slots: Slots, time_s: Floats) -> Iterator[tuple[int, int]]:
         """Replica and route of the drivers for whom there is room, and whose time has come; (R,) times."""

@@ -103,15 +103,15 @@ class Egos:
         """Put an ego at its start, where it stands."""
         self.forget(replica)
         self.front_m[replica] = self._layout.scene.ego.start_m
-        self.speed_mps[replica] = 0.0
         self._place(slice(replica, replica + 1))
 
     def forget(self, replica: int) -> None:
         """Forget what happened in a replica."""
-        self.distance_m[replica] = np.inf
-        self._was_distance_m[replica] = np.inf
+        self.front_m[replica] = self.speed_mps[replica] = 0.0
+        self.pose[replica] = np.zeros((), POSE)
+        self.distance_m[replica] = self._was_distance_m[replica] = np.inf
         self.unsafe[replica] = False
-        self.has_claimed[replica] = False
+        self.has_claimed[replica] = self.claim_changed[replica] = False
         self._hit_slot[replica] = EMPTY
         self.collision[replica] = None
 

@@ -5,7 +5,6 @@ around the ego are asked for with a context subscription, at the same cost howev
 """
 
 import math
-import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -128,8 +127,12 @@ class OwnSlots:
         self._number: dict[str, int] = {}  # number of each vehicle that has been seen
 
     def clear(self) -> None:
-        for vehicle_id in list(self.slot):
-            self._leave(vehicle_id)
+        """Empty all slots as if they had never held a vehicle."""
+        for array in (self.present, self.front_m, self.length_m, self.width_m):
+            array[:] = 0
+        self.pose[:] = np.zeros((), POSE)
+        self.member[:] = self.vehicle_number[:] = EMPTY
+        self.slot.clear()
         self._number.clear()
 
     def follow(self, near: Mapping[str, Sight], kinds: Kinds, origin_m: tuple[float, float]) -> None:
@@ -188,6 +191,9 @@ class OwnEgos:
         return np.asarray(self._hit_slot != EMPTY)
 
     def forget(self) -> None:
+        """Forget what happened in the episode."""
+        self.front_m[:] = self.speed_mps[:] = 0.0
+        self.pose[:] = np.zeros((), POSE)
         self.distance_m[:] = np.inf
         self._was_distance_m[:] = np.inf
         self.unsafe[:] = False
@@ -245,7 +251,6 @@ class OwnSimulation:
         self.trait_of_member: Numbers = np.arange(len(scene.vtypes))
         with refusals(scene.config):
             self.connection = connect(sumo_options(scene.config, seed=0), backend)
-        self._finalizer = weakref.finalize(self, self.connection.close)
         self._kinds = Kinds(scene.config, scene.vtypes, self.connection)
         self._drives = False
         self.slots = OwnSlots(scene.max_vehicles)
@@ -258,7 +263,7 @@ class OwnSimulation:
 
     def close(self) -> None:
         """End the simulation; safe to call twice."""
-        self._finalizer()
+        self.connection.close()
 
     def reset(self, replica: int, seed: int) -> None:
         """Start a new random episode.
@@ -283,6 +288,7 @@ class OwnSimulation:
         self._drives = False
         self.slots.clear()
         self.egos.forget()
+        self.origin_m = (0.0, 0.0)
 
     def _define_ego(self) -> None:
         types, scene = self.connection.vehicletype, self.scene

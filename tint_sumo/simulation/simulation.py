@@ -5,7 +5,6 @@ in. State is kept in arrays, (R,) for egos and (R, V) for vehicle slots; the onl
 reads its lane position.
 """
 
-import weakref
 from collections.abc import Sequence
 
 import numpy as np
@@ -52,7 +51,6 @@ class Simulation:
         self.passed_m = self.layout.zones.passed_m
         self._with_ego = with_ego
         self.link = SumoLink(self.layout, replicas, backend, collision_options)
-        self._finalizer = weakref.finalize(self, self.link.connection.close)
         self.slots = Slots(replicas, self.layout)
         self.egos = Egos(replicas, self.layout)
         self.yielding = Yielding(replicas, self.population, self.layout, self.slots, self.link)
@@ -66,7 +64,7 @@ class Simulation:
 
     def close(self) -> None:
         """End the simulation; safe to call twice."""
-        self._finalizer()
+        self.link.connection.close()
 
     # Episodes
 
@@ -107,7 +105,7 @@ class Simulation:
             self.link.remove(replica, slot)
             self._forget(replica, slot)
         self.link.remove_ego(replica)
-        self.slots.rest(replica)
+        self.slots.clear(replica)
         self.egos.forget(replica)
         self._demand.stop(replica)
 

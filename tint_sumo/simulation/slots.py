@@ -68,9 +68,13 @@ class Slots:
     def begin_step(self) -> None:
         np.copyto(self._was_present, self.present)
 
-    def rest(self, replica: int) -> None:
-        """Empty all slots of a replica, which may be taken at once."""
-        self._was_present[replica] = False
+    def clear(self, replica: int) -> None:
+        """Empty all slots of a replica as if they had never held a vehicle; they may be taken at once."""
+        for array in (self.present, self.route, self.stage, self.front_m, self._lane_pos_m, self._was_present):
+            array[replica] = 0
+        self.pose[replica] = np.zeros((), POSE)
+        for array in (self.member, self.vehicle_number, self.newest):
+            array[replica] = EMPTY
 
     def free(self, replica: int) -> int:
         """A slot that may be taken, -1 if there is none."""

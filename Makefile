@@ -35,6 +35,7 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 coverage: install
 	$(BIN)/pytest -n 2 --dist worksteal --cov --cov-report=term:skip-covered
@@ -47,4 +48,4 @@ net: install
 	$(BIN)/tint-sumo net --out sumo_net
 
 clean:
-	rm -rf runs build dist .coverage* .mypy_cache .ruff_cache .pytest_cache
+	rm -rf runs build dist .coverage* .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

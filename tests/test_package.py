@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import tint_sumo
+from tint_sumo.files import write_text
 
 ROOT = Path(__file__).parents[1]
 
@@ -46,7 +48,7 @@ def test_the_wheel_works_in_a_fresh_environment(wheel: Path, tmp_path: Path) -> 
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     subprocess.run([*pip, str(wheel)], env=environment, check=True)
     (site,) = fresh.glob("lib/python*/site-packages")
-    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    (site / "dependencies.pth").write_text(f"import site; site.addsitedir({sysconfig.get_path('purelib')!r})")
     code = """
 import gymnasium
 env = gymnasium.make("tint_sumo:tint_sumo/TIntersection-v1")
@@ -87,31 +89,59 @@ def test_importing_the_package_loads_no_more_than_gymnasium() -> None:
     assert not {"torch", "libsumo", "pandas", "sklearn", "matplotlib"} & set(loaded)
 
 
-def test_floors_import_downwards_only() -> None:
-    floors = [
-        "changes compiling config errors executors files job_table processes progress provenance ranges redaction "
-        "standings stores structures timing training_log yaml_files",
-        "scenes",
-        "simulation",
-        "envs dataset",
-        "traits",
-        "policy",
-        "study",
-        "bench configuration",
-        "cli",
-    ]
-    floor_of = {name: level for level, names in enumerate(floors) for name in names.split()}
-    package = ROOT / "tint_sumo"
-    for file in package.rglob("*.py"):
-        own = file.relative_to(package).parts[0].removesuffix(".py")
-        if own == "__init__":
-            continue
-        for line in file.read_text().splitlines():
-            words = line.split()
-            if words[:1] in (["from"], ["import"]) and words[1].startswith("tint_sumo."):
-                other = words[1].split(".")[1]
-                assert floor_of[other] <= floor_of[own], f"{file}: {line.strip()}"
-                assert other == own or floor_of[other] < floor_of[own] or floor_of[own] == 0, f"{file}: {line.strip()}"
+def floors() -> list[list[str]]:
+    """Modules and packages of each floor, the lowest first, as import-linter checks them."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    (contract,) = settings["tool"]["importlinter"]["contracts"]
+    return [re.split(r"\s*[|:]\s*", layer) for layer in reversed(contract["layers"])]
+
+
+def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
+    """Check the package in a folder by the contract of this one."""
+    code = "from importlinter.cli import lint_imports_command; lint_imports_command()"
+    command = [sys.executable, "-c", code, "--no-cache", "--config", str(ROOT / "pyproject.toml")]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_packages_import_downwards_only() -> None:
+    found = lint_imports(ROOT)
+    assert found.returncode == 0, found.stdout + found.stderr
+
+
+@pytest.mark.parametrize(
+    ("importer", "line", "is_broken"),
+    [
+        ("scenes/some.py", "import tint_sumo.study.rows", True),
+        ("scenes/some.py", "from tint_sumo.study.rows import __file__", True),
+        ("scenes/some.py", "from tint_sumo import study", True),
+        ("config/some.py", "from tint_sumo import scenes", True),
+        ("policy/ppo.py", "def late() -> None:\n    from tint_sumo import study", True),
+        ("envs/rows.py", "from tint_sumo import dataset", True),
+        ("bench/measuring.py", "from tint_sumo import configuration", True),
+        ("unknown.py", "", True),
+        ("config/some.py", "from tint_sumo import errors, files", False),
+        ("study/some.py", "from tint_sumo import scenes", False),
+    ],
+)
+def test_imports_that_go_up_are_found_however_they_are_written(
+    tmp_path: Path, importer: str, line: str, is_broken: bool
+) -> None:
+    empty = [".", *(name for names in floors() for name in names), "study/rows"]
+    files = {f"{name}/__init__.py": "" for name in empty} | {importer: line}
+    for file, text in files.items():
+        write_text(tmp_path / "tint_sumo" / file, text)
+    found = lint_imports(tmp_path)
+    assert found.returncode == int(is_broken), found.stdout + found.stderr
+    assert ("BROKEN" in found.stdout or "unknown" in found.stdout) == is_broken
+
+
+def test_contributing_tells_the_floors_that_are_checked() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = re.findall(r"^\| (\d+) \| (.+?) \|", text, re.MULTILINE)
+    told = {int(floor): set(re.findall(r"`tint_sumo/(\w+)(?:\.py|/)`", places)) for floor, places in table}
+    checked = {number: set(names) for number, names in enumerate(floors())}
+    assert told.pop(0) == {"config"} < checked.pop(0)  # and its neighbours
+    assert told == checked
 
 
 def test_compiled_functions_use_nothing_of_other_files() -> None:

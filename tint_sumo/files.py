@@ -5,12 +5,16 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 
 from tint_sumo.errors import InputError
 from tint_sumo.provenance import CONFIG_FILE, PROVENANCE_FILE, made_by, present_origin
+from tint_sumo.reading import JSON_BYTES, read_file
+from tint_sumo.structures import FieldError, build_json
+
+T = TypeVar("T")
 
 RUN_FILE = "run.json"
 LOCK_FILE = ".lock"
@@ -56,21 +60,34 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(value, indent=2) + "\n")
 
 
-def read_json(path: Path, what: str) -> dict[str, Any]:
+def read_json(path: Path, what: str, most_bytes: int = JSON_BYTES) -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
-        InputError: the file is missing or damaged; ``what`` names its role in the message.
+        InputError: the file is missing, too large or damaged; ``what`` names its role in the message.
     """
+    text = read_file(path, what, most_bytes)
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"{what}: no file {path}; check the path") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{what}: {path} is damaged or unreadable ({error}); make it anew") from None
+        value = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{what}: {path} is damaged ({error}); make it anew") from None
     if not isinstance(value, dict):
         raise InputError(f"{what}: {path} is damaged (not a JSON object); make it anew")
     return value
+
+
+def read_record(path: Path, what: str, kind: type[T]) -> T:
+    """Read a JSON object as a dataclass.
+
+    Raises:
+        InputError: the file is missing, too large or damaged, or a value in it does not fit.
+    """
+    text = read_file(path, what, JSON_BYTES)
+    try:
+        found: T = build_json(kind, text)
+    except FieldError as error:
+        raise InputError(f"{what}: {path}: {error}; restore the file or make it anew") from None
+    return found
 
 
 @contextmanager

@@ -103,6 +103,8 @@ def build_json(kind: Any, text: bytes, where: Where = ()) -> Any:
     """
     from pydantic import ValidationError
 
+    if b"\\u0000" in text:
+        raise FieldError(where, "has a null character, which is no text; leave it out")
     try:
         return _adapter(kind).validate_json(b"[" + text + b"]")[0]
     except ValidationError as error:

@@ -7,15 +7,21 @@ import re
 import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from tint_sumo.errors import InputError
+from tint_sumo.reading import SETTINGS_BYTES, read_file
 from tint_sumo.structures import FieldError, Where, dotted, plain
 
+_MOST_VALUES = 20_000  # in a file
+_MOST_DIGITS = 60
+_NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+# What PyYAML raises for text that is no YAML, for aliases within what they stand for, and for tags that do not fit.
+_DAMAGE = (yaml.YAMLError, RecursionError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 _END = "\n"
 _WIDTH = 116  # width of comments and lists
 
@@ -61,27 +67,38 @@ def read_yaml(file: Path) -> YamlFile:
     """Read a file that holds a mapping, or nothing.
 
     Raises:
-        InputError: there is no such file, it is damaged, it says something twice, or holds something else.
+        InputError: there is no such file, it is too large, damaged, says something twice, or holds something else.
     """
     try:
-        text = file.read_text(encoding="utf-8")
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"no file {file}; check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} is not a readable text file ({error}); give a YAML file") from None
+        text = read_file(file, "configuration", SETTINGS_BYTES).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file} is not a text file ({error}); give a YAML file") from None
     try:
-        root = yaml.compose(text, Loader=_Loader)
-        lines = dict(_lines(root, ())) if root is not None else {}
-        content = yaml.load(text, Loader=_Loader)
+        content, lines = _parse(text)
     except FieldError as error:
         raise InputError(f"{file}, {error}") from None
-    except (yaml.YAMLError, RecursionError) as error:  # an alias can stand within what it stands for
+    except _DAMAGE as error:
         raise InputError(f"{file}{_syntax(error)}") from None
     if content is None:
         content = {}
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold a mapping, lines such as 'seed: 1', not {type(content).__name__}")
     return YamlFile(file, content, lines)
+
+
+def _parse(text: str) -> tuple[Any, dict[Where, int]]:
+    """What a text says, and the lines of its values."""
+    loader = _Loader(text)
+    try:
+        root = loader.get_single_node()
+        if root is None:
+            return None, {}
+        lines = dict(islice(_lines(root, ()), _MOST_VALUES + 1))
+        if len(lines) > _MOST_VALUES:  # aliases of aliases become any number of values
+            raise FieldError((), f"line 1: more than {_MOST_VALUES:,} values; leave out what is there by aliases")
+        return loader.construct_document(root), lines
+    finally:
+        loader.dispose()
 
 
 def read_list(text: str) -> list[Any]:
@@ -91,18 +108,22 @@ def read_list(text: str) -> list[Any]:
         InputError: it is not YAML.
     """
     try:
-        values: list[Any] = yaml.load(f"[{text}]", Loader=_Loader)
-    except (yaml.YAMLError, RecursionError):
+        values: list[Any] = _parse(f"[{text}]")[0]
+    except (FieldError, *_DAMAGE):
         raise InputError(f"{text!r} must be values with commas between them, such as 0.001,0.003") from None
     return values
 
 
 def _lines(node: yaml.Node, where: Where) -> Iterator[tuple[Where, int]]:
     """The way to each value below a node, and the line it begins in."""
-    if isinstance(node, yaml.MappingNode):
+    if isinstance(node, yaml.ScalarNode):
+        _require_text(node)
+    elif isinstance(node, yaml.MappingNode):
         seen = set()
         for key, value in node.value:
             line, way = key.start_mark.line + 1, (*where, str(key.value))
+            if isinstance(key, yaml.ScalarNode):
+                _require_text(key)
             if way in seen:
                 raise FieldError((), f"line {line}: {dotted(way)} is said twice; leave one of them")
             seen.add(way)
@@ -112,6 +133,15 @@ def _lines(node: yaml.Node, where: Where) -> Iterator[tuple[Where, int]]:
         for number, item in enumerate(node.value):
             yield (*where, number), item.start_mark.line + 1
             yield from _lines(item, (*where, number))
+
+
+def _require_text(node: yaml.ScalarNode) -> None:
+    """Raise FieldError if a value has characters that no name of a file has, or is too long to be a number."""
+    line = node.start_mark.line + 1
+    if "\0" in node.value or any("\ud800" <= one <= "\udfff" for one in node.value):
+        raise FieldError((), f"line {line}: {node.value!r} has a character that is no text; leave it out")
+    if len(node.value) > _MOST_DIGITS and node.tag in _NUMBERS:
+        raise FieldError((), f"line {line}: a number has more than {_MOST_DIGITS} digits; give fewer")
 
 
 def _syntax(error: Exception) -> str:

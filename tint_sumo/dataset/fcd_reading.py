@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from tint_sumo.errors import InputError
+from tint_sumo.reading import TABLE_BYTES, require_file
 
 _NAMES = {  # names of the columns in SUMO's tables
     "timestep_time": "time_s",
@@ -38,8 +39,7 @@ def read_fcd(file: Path) -> pd.DataFrame:
         InputError: no such file, a damaged one or none with floating-car data, a vehicle lacks an attribute, or there
             is no vehicle.
     """
-    if not file.is_file():
-        raise InputError(f"{file} is no file; give what sumo --fcd-output wrote")
+    require_file(file, "floating-car data", TABLE_BYTES)
     try:
         rows = _read_table(file) if {".csv", ".parquet"} & set(file.suffixes) else _read_xml(file)
     except InputError:

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tint_sumo.errors import InputError
+from tint_sumo.reading import TABLE_BYTES, require_file
 
 SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"
@@ -113,6 +114,8 @@ def read_shard_metadata(file: Path) -> pq.FileMetaData:
 
 @contextmanager
 def _mendable(file: Path) -> Iterator[None]:
+    for one in file.glob("shard-*.parquet") if file.is_dir() else [file] if file.exists() else []:
+        require_file(one, "shard of a dataset", TABLE_BYTES)
     try:
         yield
     except FileNotFoundError:

@@ -19,6 +19,7 @@ import sumolib
 
 from tint_sumo.config import Claim, EgoController, VehicleShape
 from tint_sumo.errors import InputError
+from tint_sumo.reading import TABLE_BYTES, require_file
 from tint_sumo.scenes.scene import EgoTask
 
 NET_VERSION = (1, 20)  # the version that this SUMO's netconvert writes into networks
@@ -223,8 +224,7 @@ def _elements(file: Path, what: str) -> Iterator[Any]:
     Raises:
         InputError: there is no such file, or it is damaged.
     """
-    if not file.is_file():
-        raise InputError(f"{what}: no file {file}; check the path")
+    require_file(file, what, TABLE_BYTES)
     try:
         with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as text:
             for _, element in ElementTree.iterparse(text):
@@ -263,8 +263,7 @@ def read_net(file: Path, *, with_internal: bool = True) -> Any:
     Raises:
         InputError: there is no such file, it is no network, or one of a newer SUMO.
     """
-    if not file.is_file():
-        raise InputError(f"{file} is no file; give the scenario's .net.xml")
+    require_file(file, "SUMO network", TABLE_BYTES)
     try:
         net = sumolib.net.readNet(str(file), withInternal=with_internal)
     except (SAXException, ValueError, KeyError, OSError, EOFError) as error:

@@ -6,6 +6,7 @@ from pathlib import Path
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, write_json
 from tint_sumo.progress import Progress, Report
+from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.scenes import T_INTERSECTION, Scene
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Trials
@@ -57,7 +58,7 @@ def read_ceilings(out: Path) -> dict[float, float]:
         InputError: the file is damaged.
     """
     file = out / CEILINGS_FILE
-    found = read_json(file, "ceilings") if file.exists() else {}
+    found = read_json(file, "ceilings", RESULT_BYTES) if file.exists() else {}
     try:
         return {float(p): float(share) for p, share in found.items()}
     except (TypeError, ValueError) as error:

@@ -15,6 +15,7 @@ from tint_sumo.executors import Executor
 from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import read_json, write_json
 from tint_sumo.progress import Report
+from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.scenes import AnyScene, OwnScene, find_scene
 from tint_sumo.standings import Title
 from tint_sumo.study.evaluation import BATCH, Case, Evaluation, evaluate, require_cases
@@ -80,7 +81,7 @@ class CasesJob:
 
     def cases(self) -> tuple[Case, ...]:
         """What came out."""
-        return tuple(Case(*one) for one in read_json(self.file, "cases")["cases"])
+        return tuple(Case(*one) for one in read_json(self.file, "cases", RESULT_BYTES)["cases"])
 
 
 def evaluate_on(

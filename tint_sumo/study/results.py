@@ -8,6 +8,7 @@ from tint_sumo.config import Idm, Share
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
+from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import CASES, Case, Evaluation
 from tint_sumo.study.folders import RESULTS
@@ -56,7 +57,7 @@ class Result:
     @classmethod
     def read(cls, file: Path) -> "Result":
         """Raises InputError if the file is damaged."""
-        content = read_json(file, "result of a study")
+        content = read_json(file, "result of a study", RESULT_BYTES)
         try:
             scene_tau_s = float(content.get("scene_tau_s", Idm.tau_s))
             tested = tuple(

@@ -17,6 +17,7 @@ from tint_sumo.executors import Job, Workers, executor_of
 from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import claim_folder, read_json, write_json, write_text
 from tint_sumo.progress import Report
+from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.scenes import SCENES, T_INTERSECTION
 from tint_sumo.standings import Title
 from tint_sumo.structures import Many
@@ -189,7 +190,7 @@ class TransferJob:
 
 
 def _report(out: Path) -> pd.DataFrame:
-    found = [read_json(file, "result of the study") for file in sorted((out / RESULTS).glob("*.json"))]
+    found = [read_json(file, "result of the study", RESULT_BYTES) for file in sorted((out / RESULTS).glob("*.json"))]
     keys = ("method", "trained_on", "seed")
     table = pd.DataFrame([{key: one[key] for key in keys} | row for one in found for row in one["scenes"]])
     write_text(out / "scenes.csv", table.to_csv(index=False))

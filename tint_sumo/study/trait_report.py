@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, whole_file, write_text
+from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.tables import markdown_table
 
@@ -50,7 +51,7 @@ def write_trait_report(out: Path) -> TraitReport:
 
 def _read_results(out: Path) -> list[dict[str, Any]]:
     files = sorted((out / RESULTS).glob("*.json"))
-    contents = [read_json(file, "result of a trait study") for file in files]
+    contents = [read_json(file, "result of a trait study", RESULT_BYTES) for file in files]
     for file, content in zip(files, contents, strict=True):
         if content.get("kind") not in ("comparison", "continuous"):
             raise InputError(f"{file} is not a result of a trait study; remove it and run the study again")

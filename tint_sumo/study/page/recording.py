@@ -19,6 +19,7 @@ from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import read_json, write_text
 from tint_sumo.policy.storage import read_policy_card, weights_file
 from tint_sumo.progress import Progress, Report, part_of
+from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Conditions
@@ -109,7 +110,10 @@ class Recording:
         Raises:
             InputError: there is no such policy, or the file is damaged.
         """
-        return self.file.exists() and read_json(self.file, "recorded episodes").get("recorded") == self._identity
+        return (
+            self.file.exists()
+            and read_json(self.file, "recorded episodes", RESULT_BYTES).get("recorded") == self._identity
+        )
 
     def make(self, report: Report) -> None:
         contender = self._contender()
@@ -182,7 +186,7 @@ def read_episodes(file: Path) -> dict[int, dict[str, Any]]:
     Raises:
         InputError: the file is missing or damaged.
     """
-    content = read_json(file, "recorded episodes")
+    content = read_json(file, "recorded episodes", RESULT_BYTES)
     try:
         return {int(case): dict(one) for case, one in content["episodes"].items()}
     except (LookupError, TypeError, ValueError, AttributeError) as error:

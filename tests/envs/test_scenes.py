@@ -51,7 +51,7 @@ def test_episodes_end_in_all_ways_and_what_is_observed_stays_in_bounds(name: str
             actions = np.where(np.arange(24) < 16, 2, 0) if step % 3 else np.full(24, 1)
             observation, _, terminated, truncated, infos = env.step(actions)
             if (terminated | truncated).any():
-                outcomes |= set(infos["final_info"]["outcome"][terminated | truncated].tolist())
+                outcomes |= set(infos["outcome"][terminated | truncated].tolist())
             assert env.observation_space.contains(observation)
             # Whoever is near is seen where it is, not at the bounds of the space.
             seen = observation["mask"] > 0.5

@@ -24,6 +24,7 @@ def test_episodes_of_the_t_intersection_are_those_of_its_version() -> None:
         num_envs=replicas,
         vectorization_mode="vector_entry_point",
         p_conservative=(0.1, 0.9),
+        autoreset_mode="SameStep",
     )
     assert isinstance(env, SceneVectorEnv) and isinstance(env.batch, LocalBatch)
     simulation, found = env.batch.episodes.simulation, hashlib.sha256()

@@ -1,6 +1,5 @@
 """Environments in a batch, whose episodes follow one another."""
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,20 +7,21 @@ from typing import Any, Protocol
 
 import numpy as np
 from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from tint_sumo.envs.episodes import Episodes, TaskSettings
 from tint_sumo.envs.rendering import render_scene
-from tint_sumo.envs.rows import STEP_FIELDS, Rows, outcome_name
+from tint_sumo.envs.rows import Rows, outcome_name
 from tint_sumo.timing import StepPart, does
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How an environment's episode ended, as seen before its next one began in the same step."""
+    """How an environment's episode ended."""
 
     index: int
-    row: np.void  # what it told
+    row: np.void  # its last row
     collision: dict[str, Any]  # empty without one
 
     @property
@@ -38,7 +38,12 @@ class Snapshot:
 
 
 class Batch(Protocol):
-    """Environments that step together."""
+    """Environments that step together.
+
+    What follows an episode's end is said by a mode, with the meanings of gymnasium's vector environments: the next
+    episode begins in the same step (``SAME_STEP``), in the next one instead of the action (``NEXT_STEP``), or with the
+    next reset (``DISABLED``); until then the environment's row shows how the episode ended.
+    """
 
     rows: Rows  # (N,) what the environments tell; written anew by each call
 
@@ -46,7 +51,7 @@ class Batch(Protocol):
         """Start a new episode where the mask (N,) is true; without a seed, from the environment's own generator."""
 
     def step(self, actions: NDArray[np.integer]) -> list[Ended]:
-        """Take valid actions (N,); an episode that ends is followed by the next one at once."""
+        """Take valid actions (N,); the episodes that have ended. With ``DISABLED`` none may have ended before."""
 
     def park(self, mask: NDArray[np.bool_]) -> None:
         """Empty the environments where the mask (N,) is true: they cost next to nothing until their next reset."""
@@ -65,14 +70,17 @@ class Batch(Protocol):
 class LocalBatch:
     """A batch in this process: replicas of one simulation."""
 
-    def __init__(self, num_envs: int, settings: TaskSettings, rows: Rows | None = None) -> None:
+    def __init__(
+        self, num_envs: int, settings: TaskSettings, autoreset_mode: AutoresetMode, rows: Rows | None = None
+    ) -> None:
+        self._autoreset_mode = autoreset_mode
         self.episodes = Episodes(num_envs, settings, rows)
         self.rows = self.episodes.rows
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._began: list[dict[str, Any]] = [{}] * num_envs  # states of the generators when the episodes began
-        scene = settings.played
-        longest = math.ceil(scene.time_limit_s / scene.step_s) + 1
-        self._actions: deque[NDArray[np.integer]] = deque(maxlen=longest)  # of the last steps, (N,) each
+        self._steps_per_decision = settings.steps_per_decision
+        # The actions of the last decisions, (N,) each.
+        self._actions: deque[NDArray[np.integer]] = deque(maxlen=settings.decisions_per_episode + 1)
 
     def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> None:
         for index in np.flatnonzero(mask).tolist():
@@ -89,13 +97,22 @@ class LocalBatch:
     @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> list[Ended]:
         self._actions.append(actions.astype(np.int8))
-        if not self.episodes.step(actions):
+        due = self._over() if self._autoreset_mode is AutoresetMode.NEXT_STEP else []
+        any_ended = len(due) < len(self.rows) and self.episodes.step(actions)
+        for index in due:
+            self._begin(index)
+        if not any_ended:
             return []
-        ended = [self._ended(index) for index in np.flatnonzero(self.rows["outcome"]).tolist()]
-        for one in ended:
-            self._begin(one.index)
-            self.rows[STEP_FIELDS][one.index] = one.row[STEP_FIELDS]
+        ended = [self._ended(index) for index in self._over()]
+        if self._autoreset_mode is AutoresetMode.SAME_STEP:
+            for one in ended:
+                self._begin(one.index)
         return ended
+
+    def _over(self) -> list[int]:
+        """Environments whose episode has ended and whose next one has not begun."""
+        over: list[int] = np.flatnonzero(self.rows["outcome"]).tolist()
+        return over
 
     def park(self, mask: NDArray[np.bool_]) -> None:
         for index in np.flatnonzero(mask).tolist():
@@ -103,7 +120,8 @@ class LocalBatch:
 
     def snapshot(self) -> list[Snapshot]:
         taken = np.array(self._actions, np.int8).reshape(-1, len(self._began))
-        first = len(taken) - self.episodes.steps  # of the present episodes
+        decisions = -(-self.episodes.steps // self._steps_per_decision)  # the last one may have been cut short
+        first = len(taken) - decisions  # of the present episodes
         return [
             Snapshot(began, tuple(taken[first[index] :, index].tolist())) for index, began in enumerate(self._began)
         ]

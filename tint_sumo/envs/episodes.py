@@ -10,7 +10,21 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from tint_sumo.config import POSITION_SCALE_M, REWARD_PRESETS, SPEED_SCALE_MPS, Backend, Share
-from tint_sumo.envs.rows import BOUND, NOBODY, TRACKS, Rows, Scales, TaskRules, judge, observe, observe_tracks, row_type
+from tint_sumo.envs.rows import (
+    BOUND,
+    COLLISION,
+    GOING_ON,
+    NOBODY,
+    TRACKS,
+    Rows,
+    Scales,
+    TaskRules,
+    add_up,
+    judge,
+    observe,
+    observe_tracks,
+    row_type,
+)
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, find_scene
 from tint_sumo.scenes.geometry import Floats
@@ -18,6 +32,7 @@ from tint_sumo.simulation.own import make_simulation
 from tint_sumo.timing import StepPart, does
 
 _SEED_LIMIT = 2**63
+_STEP_TOLERANCE = 1e-6  # of decision_s in steps, for numbers such as 0.3 / 0.1
 
 
 @dataclass(frozen=True)
@@ -35,6 +50,7 @@ class TaskSettings:
     position_noise_m: float = 0.0
     tau_s: float | None = None
     tracks: bool = False
+    decision_s: float | None = None
     backend: Backend = "auto"
 
     def __post_init__(self) -> None:
@@ -47,6 +63,24 @@ class TaskSettings:
             raise InputError(
                 f"time_limit_s must be at least a step of {scene.step_s:g} s, and finite, not {scene.time_limit_s}"
             )
+        steps = self._decision_s / scene.step_s
+        if not (math.isfinite(steps) and math.isclose(steps, max(round(steps), 1), rel_tol=_STEP_TOLERANCE)):
+            raise InputError(f"decision_s must be a multiple of the step of {scene.step_s:g} s, not {self.decision_s}")
+
+    @property
+    def _decision_s(self) -> float:
+        return self.played.step_s if self.decision_s is None else self.decision_s
+
+    @property
+    def steps_per_decision(self) -> int:
+        """Simulation steps in each of which an action is taken once more."""
+        return round(self._decision_s / self.played.step_s)
+
+    @property
+    def decisions_per_episode(self) -> int:
+        """Most decisions in an episode."""
+        scene = self.played
+        return math.ceil(round(scene.time_limit_s / scene.step_s) / self.steps_per_decision)
 
     @property
     def slot_infos(self) -> tuple[str, ...]:
@@ -116,7 +150,8 @@ class Episodes:
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
         self._scales = Scales(POSITION_SCALE_M, SPEED_SCALE_MPS, scene.step_s)
         self._speeds_mps = np.array(scene.ego.controller.desired_speeds_mps)
-        self.steps = np.zeros(num_envs, np.int64)
+        self._steps_per_decision = settings.steps_per_decision
+        self.steps = np.zeros(num_envs, np.int64)  # simulation steps since each episode's start
         self._parked: set[int] = set()
         self._noise: dict[int, np.random.Generator] = {}  # the generator of each environment, if there is noise
         self._noise_m: Floats = np.zeros((num_envs, scene.max_vehicles, 2))
@@ -139,9 +174,31 @@ class Episodes:
 
     @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> bool:
-        """Take an action, the number of a desired speed, in each environment; (N,). Whether any episode has ended."""
-        simulation = self.simulation
+        """Take a decision in each environment: an action, the number of a desired speed, for ``steps_per_decision``.
+
+        An episode that ends within the decision is shown as it ended, while the others go on; its ego brakes to a stop.
+
+        Args:
+            actions: (N,).
+
+        Returns:
+            whether any episode has ended.
+        """
         desired_mps = self._speeds_mps[actions]
+        any_ended = self._step(desired_mps)
+        for _ in range(self._steps_per_decision - 1):
+            over = self.rows["outcome"] != GOING_ON
+            if over.all():
+                break
+            before = self.rows.copy()
+            any_ended |= self._step(np.where(over, 0.0, desired_mps))
+            add_up(before, self.rows)
+            self.steps[over] -= 1
+        return any_ended
+
+    def _step(self, desired_mps: Floats) -> bool:
+        """Simulate one step; whether any episode has ended."""
+        simulation = self.simulation
         if self._parked:
             parked = list(self._parked)
             desired_mps[parked], self.steps[parked] = 0.0, -1
@@ -189,9 +246,9 @@ class Episodes:
         )
 
     def collision_info(self, index: int) -> dict[str, Any]:
-        """Who was hit where; empty without a collision."""
+        """Who was hit where; empty if the episode has not ended with a collision."""
         event = self.simulation.egos.collision[index]
-        if event is None:
+        if event is None or self.rows["outcome"][index] != COLLISION:
             return {}
         trait = self.simulation.traits[self.simulation.trait_of_member[event.member]]
         return {"trait": trait, "route": event.route, "slot": event.slot, "ego_m": (event.ego_x_m, event.ego_y_m)}

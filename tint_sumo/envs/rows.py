@@ -1,6 +1,7 @@
 """What each environment has to tell after a step: one record, written by compiled code."""
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +18,7 @@ OBSERVATION_KEYS = ("ego", "vehicles", "mask")
 TRACKS = ("position_m", "gap_m", "passed")  # per vehicle slot, if they are asked for
 REWARD_TERMS = ("goal", "collision", "speed", "step")
 OUTCOMES = ("success", "timeout", "collision")
-STEP_FIELDS = ["terminated", "truncated", "reward", *REWARD_TERMS]  # of a row: what the last step was worth
-_GOING_ON, _SUCCESS, _TIMEOUT, _COLLISION = range(4)  # numbers of outcomes in rows: positions in OUTCOMES, plus 1
+GOING_ON, _SUCCESS, _TIMEOUT, COLLISION = range(4)  # numbers of outcomes in rows: positions in OUTCOMES, plus 1
 NOBODY = -1  # the trait of an empty slot
 BOUND = 2.0  # limit of normalised observations: 40 m, 6 m/s
 
@@ -48,9 +48,46 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
     )
 
 
+_OUTCOME_NAMES = np.array(["", *OUTCOMES], object)  # by their numbers in rows
+
+
 def outcome_name(code: int) -> str:
-    """Of a row's outcome; empty while the episode goes on."""
-    return OUTCOMES[code - 1] if code else ""
+    """Return the name of a row's outcome; empty while the episode goes on."""
+    return str(_OUTCOME_NAMES[code])
+
+
+def outcome_names(codes: NDArray[np.int64]) -> NDArray[np.object_]:
+    """Return the names (N,) of the outcomes of rows."""
+    return _OUTCOME_NAMES[codes]
+
+
+def fields_of(row: np.void) -> dict[str, Any]:
+    """Return a row's fields as Python's numbers and views of the row's arrays."""
+    return dict(zip(row.dtype.names or (), row.item(), strict=True))
+
+
+def observation_of(fields: Mapping[str, NDArray[Any]]) -> Observation:
+    """Return the observation among the fields of a row, or of all rows."""
+    return {key: fields[key] for key in OBSERVATION_KEYS}
+
+
+def start_info(fields: Mapping[str, Any], slot_infos: Sequence[str]) -> dict[str, Any]:
+    """Return the info of an environment after a reset; ``slot_infos`` are the fields per vehicle slot that it holds."""
+    slots = {key: fields[key].copy() for key in slot_infos}
+    return {**slots, "outcome": outcome_name(fields["outcome"]), "time_s": fields["time_s"]}
+
+
+def step_info(fields: Mapping[str, Any], slot_infos: Sequence[str], collision: dict[str, Any]) -> dict[str, Any]:
+    """Return the info of an environment after a step; ``collision`` is empty without one."""
+    info = start_info(fields, slot_infos)
+    info["reward_terms"] = {term: fields[term] for term in REWARD_TERMS}
+    return info | end_info(info["outcome"], collision)
+
+
+def end_info(outcome: str, collision: dict[str, Any]) -> dict[str, Any]:
+    """Return what a step's info holds only where an episode has ended with this outcome; nothing without one."""
+    ending: dict[str, Any] = {"is_success": outcome == "success"} if outcome else {}
+    return {**ending, "collision": collision} if collision else ending
 
 
 class TaskRules(NamedTuple):
@@ -87,20 +124,42 @@ def judge(front_m: Floats, speed_mps: Floats, collided: Bools, steps: Numbers, r
     for index in range(len(rows)):
         row = rows[index]
         if collided[index]:
-            row.outcome = _COLLISION
+            row.outcome = COLLISION
         elif front_m[index] > rules.goal_m:
             row.outcome = _SUCCESS
         else:
-            row.outcome = _TIMEOUT if steps[index] >= rules.step_limit else _GOING_ON
-        row.terminated = row.outcome in (_SUCCESS, _COLLISION)
+            row.outcome = _TIMEOUT if steps[index] >= rules.step_limit else GOING_ON
+        row.terminated = row.outcome in (_SUCCESS, COLLISION)
         row.truncated = row.outcome == _TIMEOUT
         row.goal = rules.goal if row.outcome == _SUCCESS else 0.0
-        row.collision = rules.collision if row.outcome == _COLLISION else 0.0
+        row.collision = rules.collision if row.outcome == COLLISION else 0.0
         row.speed = 0.0 if row.terminated else rules.speed_weight_per_mps * speed_mps[index]
         row.step = 0.0 if row.terminated else rules.step
         row.reward = row.goal + row.collision + row.speed + row.step
-        any_ended = any_ended or row.outcome != _GOING_ON
+        any_ended = any_ended or row.outcome != GOING_ON
     return any_ended
+
+
+@compiled
+def add_up(before: Rows, rows: Rows) -> None:
+    """Make rows of a step those of all steps of a decision so far.
+
+    Rewards and their terms are summed up. Where an episode had ended already, the row stays as it was then.
+
+    Args:
+        before: (N,) rows of the decision's steps before this one.
+        rows: (N,) rows of this step, changed in place.
+    """
+    for index in range(len(rows)):
+        row, earlier = rows[index], before[index]
+        if earlier.outcome != GOING_ON:
+            rows[index] = earlier
+        else:
+            row.goal += earlier.goal
+            row.collision += earlier.collision
+            row.speed += earlier.speed
+            row.step += earlier.step
+            row.reward += earlier.reward
 
 
 class Scales(NamedTuple):

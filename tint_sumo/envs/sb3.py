@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from tint_sumo.envs.batch import Snapshot
+from tint_sumo.envs.rows import end_info, fields_of, observation_of
 from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.timing import StepPart, does
 
@@ -18,7 +20,8 @@ class SceneVecEnv(VecEnv):
 
     Takes the arguments of ``tint_sumo.envs.scene_env.SceneEnv``. ``infos[i]`` holds ``traits``, the
     true traits that go with the returned observation; when an episode ends also ``terminal_observation``,
-    ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``time_s`` and, after a collision, ``collision``.
+    ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``is_success``, ``time_s`` and, after a collision,
+    ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then.
     ``slots`` holds arrays (N, V) of what else is known of the vehicles in the returned observations, and
     ``terminal_slots`` the same of the terminal one: ``traits``, and with ``tracks`` also ``position_m``, ``gap_m`` and
     ``passed``.
@@ -27,7 +30,7 @@ class SceneVecEnv(VecEnv):
     slots: dict[str, NDArray[Any]]
 
     def __init__(self, num_envs: int, seed: int | None = None, **settings: Any) -> None:
-        self.env = SceneVectorEnv(num_envs, **settings)
+        self.env = SceneVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
         super().__init__(num_envs, self.env.single_observation_space, self.env.single_action_space)
         self._actions: NDArray[np.int64] = np.zeros(num_envs, np.int64)
         if seed is not None:
@@ -47,22 +50,21 @@ class SceneVecEnv(VecEnv):
 
     @does(StepPart.ADAPTER)
     def step_wait(self) -> VecEnvStepReturn:
-        observation, reward, terminated, truncated, infos = self.env.step(self._actions)
-        done = terminated | truncated
-        self._keep_slots(infos)
-        listed: list[dict[str, Any]] = [{"traits": traits, "outcome": ""} for traits in infos["traits"]]
-        for index in np.flatnonzero(done).tolist():
-            final = infos["final_info"]
-            listed[index] |= {
-                "terminal_observation": infos["final_obs"][index],
-                "TimeLimit.truncated": bool(truncated[index]),
-                "terminal_slots": {key: final[key][index] for key in self.env.slot_infos},
-                "outcome": str(final["outcome"][index]),
-                "time_s": float(final["time_s"][index]),
+        rows, ended = self.env.advance(self._actions)
+        self._keep_slots(rows)
+        listed: list[dict[str, Any]] = [{"traits": traits, "outcome": ""} for traits in rows["traits"]]
+        for one in ended:
+            last = fields_of(one.row)
+            listed[one.index] |= {
+                "terminal_observation": observation_of(last),
+                "TimeLimit.truncated": last["truncated"],
+                "terminal_slots": {key: last[key] for key in self.env.slot_infos},
+                "outcome": one.outcome,
+                "time_s": last["time_s"],
+                **end_info(one.outcome, one.collision),
             }
-            if final["_collision"][index]:
-                listed[index]["collision"] = final["collision"][index]
-        return observation, reward.astype(np.float32), done, listed
+        done = rows["terminated"] | rows["truncated"]
+        return observation_of(rows), rows["reward"].astype(np.float32), done, listed
 
     def snapshot(self) -> list[Snapshot]:
         """As in ``SceneVectorEnv``."""

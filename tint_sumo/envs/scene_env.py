@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_actions
 from tint_sumo.envs.rendering import RENDER_FPS, render_scene, require_render_mode
-from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, outcome_name
+from tint_sumo.envs.rows import Observation, fields_of, observation_of, start_info, step_info
 from tint_sumo.envs.window import Window
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
@@ -73,6 +73,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `outcome`      | `"success"`, `"collision"`, `"timeout"`, or `""` while the episode goes on                  |
     | `reward_terms` | the reward's named terms (after a step)                                                     |
     | `time_s`       | time since the episode's start                                                              |
+    | `is_success`   | at the episode's end: whether the outcome is `"success"`                                    |
     | `collision`    | after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`                 |
 
     ## Arguments
@@ -91,6 +92,10 @@ class SceneEnv(gymnasium.Env[Any, Any]):
       ones.
     * `tracks`: tell in the infos, too, where vehicles are seen on their routes, with the same noise as in the
       observations; that is what trait models take. Default False.
+    * `decision_s`: an action holds for so long, a multiple of the simulation's step (0.1 s in the built-in scenes), or
+      until the episode ends. A step of the environment then is so many steps of the simulation, at each of which the
+      controller and its safety check work; `reward` and `reward_terms` are their sums, and everything else is as after
+      the last of them. Default: one step of the simulation.
     * `backend`: `"libsumo"`, `"traci"` (a sumo subprocess), or `"auto"` (default): libsumo if no other environment of
       this process uses it, since libsumo holds one simulation per process.
     * `render_mode`: `None`, `"rgb_array"`, or `"human"`: a window follows the episodes in real time. It needs a
@@ -130,8 +135,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         self._begin()
         self._show()
-        told = self._told()
-        return _observation(told), self._info(told)
+        return self._shown()
 
     def _begin(self) -> None:
         self._began = dict(self.np_random.bit_generator.state)
@@ -143,12 +147,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         require_actions(actions, 1, int(self.action_space.n))
         self._step(actions)
         self._show()
-        told = self._told()
-        info = self._info(told)
-        info["reward_terms"] = {term: told[term] for term in REWARD_TERMS}
-        if info["outcome"] == "collision":
-            info["collision"] = self._episodes.collision_info(0)
-        return _observation(told), told["reward"], told["terminated"], told["truncated"], info
+        fields = fields_of(self._episodes.rows[0])
+        info = step_info(fields, self._slot_infos, self._episodes.collision_info(0))
+        return _observation(fields), fields["reward"], fields["terminated"], fields["truncated"], info
 
     def _step(self, actions: NDArray[np.int64]) -> None:
         self._actions.append(int(actions[0]))
@@ -180,17 +181,12 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         for action in snapshot.actions:
             self._step(np.array([action]))
         self._show()
-        told = self._told()
-        return _observation(told), self._info(told)
+        return self._shown()
 
-    def _info(self, told: dict[str, Any]) -> dict[str, Any]:
-        slots = {key: told[key].copy() for key in self._slot_infos}
-        return {**slots, "outcome": outcome_name(told["outcome"]), "time_s": told["time_s"]}
-
-    def _told(self) -> dict[str, Any]:
-        """The row's fields as Python's numbers, and arrays that the next step overwrites."""
-        rows = self._episodes.rows
-        return dict(zip(rows.dtype.names or (), rows.item(), strict=True))
+    def _shown(self) -> tuple[Observation, dict[str, Any]]:
+        """The observation and info where the episode is."""
+        fields = fields_of(self._episodes.rows[0])
+        return _observation(fields), start_info(fields, self._slot_infos)
 
     def render(self) -> NDArray[np.uint8] | None:
         """(H, W, 3) image of the scene; conservative drivers blue, aggressive red, the ego yellow.
@@ -209,5 +205,5 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._episodes.simulation.close()
 
 
-def _observation(told: dict[str, Any]) -> Observation:
-    return {key: told[key].copy() for key in OBSERVATION_KEYS}
+def _observation(fields: dict[str, Any]) -> Observation:
+    return {key: array.copy() for key, array in observation_of(fields).items()}

@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from tint_sumo.envs.batch import Batch, Ended, LocalBatch, Snapshot
 from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space, require_actions
 from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
-from tint_sumo.envs.rows import OBSERVATION_KEYS, REWARD_TERMS, Observation, copied
+from tint_sumo.envs.rows import (
+    GOING_ON,
+    REWARD_TERMS,
+    Observation,
+    copied,
+    end_info,
+    fields_of,
+    observation_of,
+    outcome_names,
+    step_info,
+)
 from tint_sumo.envs.workers import WorkerBatch
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, OwnScene, Scene
@@ -22,9 +32,14 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     """``num_envs`` times ``tint_sumo.envs.scene_env.SceneEnv``, whose docstring is the manual.
 
     Environment ``i`` seeded with ``seed + i`` lives through exactly the episodes of a single environment with that
-    seed, whatever ``num_envs`` is. A finished episode is followed by the next one in the same step
-    (``AutoresetMode.SAME_STEP``): its last observation and info stand in ``infos["final_obs"]`` and
-    ``infos["final_info"]``. All other infos are arrays over the environments.
+    seed, whatever ``num_envs`` is. The infos are arrays over the environments, each with a mask under ``"_key"`` that
+    says where it holds.
+
+    ``autoreset_mode`` says what follows an episode's end, as in gymnasium's ``SyncVectorEnv``: an ``AutoresetMode``, or
+    its value. With ``"NextStep"`` (default) the environment's next step begins the next episode; that step ignores the
+    action, and its reward is 0. With ``"SameStep"`` the next episode begins in the step that ends the one before, whose
+    last observation and info stand in ``infos["final_obs"]`` and ``infos["final_info"]``. With ``"Disabled"`` it begins
+    with ``reset(options={"reset_mask": mask})``, whose mask (N,) is true for the environments to reset.
 
     ``scene`` may also be a list of scenes: the environments are shared out among them, in order and as evenly as can
     be, and each scene has a process of its own.
@@ -38,7 +53,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     metadata = {  # noqa: RUF012 - gymnasium's way
         "render_modes": ["rgb_array"],
         "render_fps": RENDER_FPS,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
     def __init__(
@@ -47,6 +62,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         scene: AnyScene | Sequence[AnyScene] = T_INTERSECTION,
         render_mode: str | None = None,
         workers: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **task: Any,
     ) -> None:
         if num_envs < 1:
@@ -64,6 +80,8 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         settings = all_settings[0]
         if len({one.played.max_vehicles for one in all_settings}) > 1:
             raise InputError("scenes of one environment must observe the same number of vehicles; change max_vehicles")
+        self._mode = _autoreset_mode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.num_envs = num_envs
         self.slot_infos = settings.slot_infos
         self.render_mode = render_mode
@@ -71,7 +89,11 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self.single_action_space: spaces.Discrete = action_space(settings.played)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.batch: Batch = LocalBatch(num_envs, settings) if len(scenes) == 1 else WorkerBatch(num_envs, all_settings)
+        self.batch: Batch = (
+            LocalBatch(num_envs, settings, self._mode)
+            if len(scenes) == 1
+            else WorkerBatch(num_envs, all_settings, self._mode)
+        )
         self._has_begun = False
 
     def reset(
@@ -86,23 +108,55 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             seeds = seed
         if len(seeds) != self.num_envs:
             raise InputError(f"{len(seeds)} seeds do not fit {self.num_envs} environments; give one number or as many")
-        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
+        mask = self._reset_mask(options or {})
         self.batch.reset(seeds, mask)
         self._has_begun = True
-        return self._shown()
+        return self._shown(mask)
+
+    def _reset_mask(self, options: dict[str, Any]) -> NDArray[np.bool_]:
+        """The environments (N,) to reset."""
+        if "reset_mask" not in options:
+            return np.ones(self.num_envs, bool)
+        mask = np.asarray(options["reset_mask"])
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            raise InputError(
+                f"reset_mask must be {self.num_envs} booleans, one for each environment, at least one of them true; "
+                f"not {options['reset_mask']!r}"
+            )
+        return mask
 
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        begun = self.batch.rows["outcome"] != GOING_ON  # those that ended before: NEXT_STEP now begins the next ones
+        if self._mode is AutoresetMode.DISABLED and begun.any():
+            raise InputError(
+                f"the episodes of environments {', '.join(map(str, np.flatnonzero(begun)))} have ended; "
+                'reset them with options={"reset_mask": mask} before the next step'
+            )
+        rows, ended = self.advance(actions)
+        if self._mode is AutoresetMode.SAME_STEP:
+            begun[[one.index for one in ended]] = True
+        infos = self._infos(rows)
+        if not begun.all():  # an episode that begins has no rewards yet
+            infos |= _masked({"reward_terms": _masked({term: rows[term] for term in REWARD_TERMS}, ~begun)}, ~begun)
+        for one in ended:
+            infos = self._add_info(infos, self._ending(one), one.index)
+        return observation_of(rows), rows["reward"], rows["terminated"], rows["truncated"], infos
+
+    def advance(self, actions: NDArray[np.int64]) -> tuple[dict[str, NDArray[Any]], list[Ended]]:
+        """Take a step; the fields of all rows after it, and the episodes that ended in it.
+
+        Rewards, terminations and truncations are those of the step, all else is as it is now.
+        """
         actions = np.asarray(actions)
         require_actions(actions, self.num_envs, int(self.single_action_space.n))
         ended = self.batch.step(actions)
         rows = copied(self.batch.rows)
-        infos = self._infos(rows)
-        infos |= self._everywhere({"reward_terms": self._everywhere({term: rows[term] for term in REWARD_TERMS})})
-        if ended:
-            infos |= self._final(infos, ended)
-        return _observation(rows), rows["reward"], rows["terminated"], rows["truncated"], infos
+        for one in ended:
+            for key in ("reward", "terminated", "truncated"):
+                rows[key][one.index] = one.row[key]
+        return rows, ended
 
     def snapshot(self) -> list[Snapshot]:
         """What ``restore`` needs to come back to where the episodes are now, as in ``SceneEnv``; it can be pickled.
@@ -128,33 +182,27 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._has_begun = True
         return self._shown()
 
-    def _shown(self) -> tuple[Observation, dict[str, Any]]:
-        """The observation and infos where the environments are."""
+    def _shown(self, mask: NDArray[np.bool_] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """The observation where the environments are, and the infos of those in the mask, by default of all."""
         rows = copied(self.batch.rows)
-        return _observation(rows), self._infos(rows)
+        return observation_of(rows), self._infos(rows, mask)
 
-    def _infos(self, rows: dict[str, NDArray[Any]]) -> dict[str, Any]:
-        outcome = np.full(self.num_envs, "")  # an episode that ended has been followed by the next
-        slots = {key: rows[key] for key in self.slot_infos}
-        return self._everywhere({**slots, "outcome": outcome, "time_s": rows["time_s"]})
+    def _infos(self, rows: dict[str, NDArray[Any]], mask: NDArray[np.bool_] | None = None) -> dict[str, Any]:
+        """The infos of the environments in a mask, by default of all; gymnasium has 0 or None elsewhere."""
+        infos = {**{key: rows[key] for key in self.slot_infos}, "outcome": outcome_names(rows["outcome"])}
+        infos["time_s"] = rows["time_s"]
+        if mask is None:
+            return _masked(infos, np.ones(self.num_envs, bool))
+        for values in infos.values():
+            values[~mask] = None if values.dtype == object else 0
+        return _masked(infos, mask.copy())
 
-    def _final(self, infos: dict[str, Any], ended: list[Ended]) -> dict[str, Any]:
-        """The last observation and info of the episodes that ended."""
-        final_obs, collision = (np.full(self.num_envs, None, dtype=object) for _ in range(2))
-        done, collided = (np.zeros(self.num_envs, bool) for _ in range(2))
-        told = (*self.slot_infos, "time_s")
-        final = {key: infos[key].copy() for key in told} | {"outcome": infos["outcome"].astype("U9")}
-        for one in ended:
-            done[one.index], collided[one.index] = True, bool(one.collision)
-            final_obs[one.index] = {key: one.row[key] for key in OBSERVATION_KEYS}
-            collision[one.index], final["outcome"][one.index] = one.collision, one.outcome
-            for key in told:
-                final[key][one.index] = one.row[key]
-        final_info = infos | final | _masked({"collision": collision}, collided)
-        return _masked({"final_obs": final_obs, "final_info": final_info}, done)
-
-    def _everywhere(self, values: dict[str, Any]) -> dict[str, Any]:
-        return _masked(values, np.ones(self.num_envs, bool))
+    def _ending(self, ended: Ended) -> dict[str, Any]:
+        """What the infos hold of an episode's end beside those of where its environment is now."""
+        if self._mode is not AutoresetMode.SAME_STEP:
+            return end_info(ended.outcome, ended.collision)
+        last = fields_of(ended.row)
+        return {"final_obs": observation_of(last), "final_info": step_info(last, self.slot_infos, ended.collision)}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One (H, W, 3) image per environment."""
@@ -164,8 +212,12 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self.batch.close()
 
 
-def _observation(rows: dict[str, NDArray[Any]]) -> Observation:
-    return {key: rows[key] for key in OBSERVATION_KEYS}
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        choices = ", ".join(repr(one.value) for one in AutoresetMode)
+        raise InputError(f"unknown autoreset_mode {mode!r}; choose one of {choices}") from None
 
 
 def _masked(values: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:

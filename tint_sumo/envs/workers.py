@@ -11,11 +11,13 @@ import weakref
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Ended, LocalBatch, Snapshot
@@ -37,7 +39,7 @@ class WorkerBatch:
     ends all the others.
     """
 
-    def __init__(self, num_envs: int, settings: Sequence[TaskSettings]) -> None:
+    def __init__(self, num_envs: int, settings: Sequence[TaskSettings], autoreset_mode: AutoresetMode) -> None:
         workers = len(settings)
         shared = _Shared(num_envs, workers, settings[0].played.max_vehicles)
         bounds = [num_envs * worker // workers for worker in range(workers + 1)]
@@ -49,9 +51,9 @@ class WorkerBatch:
         takes_part = settings[0].backend == "traci" or libsumo_is_free()
         try:
             for worker in range(int(takes_part), workers):
-                self._helpers.append(_start(worker, shared, self._shares[worker], settings[worker]))
+                self._helpers.append(_start(worker, shared, self._shares[worker], settings[worker], autoreset_mode))
             if takes_part:
-                self._local = LocalBatch(self._shares[0].stop, settings[0], self.rows[self._shares[0]])
+                self._local = LocalBatch(self._shares[0].stop, settings[0], autoreset_mode, self.rows[self._shares[0]])
             self._listen()
         except BaseException:
             self.close()
@@ -123,8 +125,10 @@ class _Helper:
         return answer(message, f"environment worker {self.worker}")
 
 
-def _start(worker: int, shared: "_Shared", share: slice, settings: TaskSettings) -> _Helper:
-    pipe, process = start_worker(_serve, shared, worker, share, settings)
+def _start(
+    worker: int, shared: "_Shared", share: slice, settings: TaskSettings, autoreset_mode: AutoresetMode
+) -> _Helper:
+    pipe, process = start_worker(_serve, shared, worker, share, settings, autoreset_mode)
     return _Helper(worker, share, _Line(pipe, shared.sent[worker]), process)
 
 
@@ -187,16 +191,24 @@ class _Line:
         self._pipe.close()
 
 
-def _serve(pipe: Connection, shared: _Shared, worker: int, share: slice, settings: TaskSettings) -> None:
+def _serve(
+    pipe: Connection,
+    shared: _Shared,
+    worker: int,
+    share: slice,
+    settings: TaskSettings,
+    autoreset_mode: AutoresetMode,
+) -> None:
     """A worker process."""
     line = _Line(pipe, shared.sent[worker, ::-1])
     with suppress(EOFError, ConnectionError):  # the other end is closed
-        line.send(told(lambda: _answer_requests(line, shared, share, settings)))
+        make_batch = partial(LocalBatch, share.stop - share.start, settings, autoreset_mode, shared.rows[share])
+        line.send(told(lambda: _answer_requests(line, make_batch)))
 
 
-def _answer_requests(line: _Line, shared: _Shared, share: slice, settings: TaskSettings) -> None:
+def _answer_requests(line: _Line, make_batch: Callable[[], LocalBatch]) -> None:
     """Serve until the other end is gone, or a request goes wrong."""
-    batch = LocalBatch(share.stop - share.start, settings, shared.rows[share])
+    batch = make_batch()
     try:
         line.send(("done", None))
         while True:

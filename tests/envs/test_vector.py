@@ -1,0 +1,141 @@
+"""The vector environment in every autoreset mode, beside gymnasium's own."""
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+from tests.envs.test_workers import assert_infos_equal
+from tint_sumo import ENV_IDS
+from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.errors import InputError
+from tint_sumo.scenes import T_INTERSECTION
+
+ENV_ID = ENV_IDS[T_INTERSECTION]
+GO, STOP = 2, 0
+# Episodes end soon, and in every way.
+TASK: dict[str, Any] = {
+    "scene": "four_way_turn",
+    "p_conservative": 0.5,
+    "time_limit_s": 8.0,
+    "position_noise_m": 0.1,
+    "tracks": True,
+}
+
+
+def drive(env: VectorEnv[Any, Any, Any], steps: int, seed: int) -> Iterator[tuple[Any, ...]]:
+    """All that an environment returns in so many steps, and its resets where it does not reset by itself."""
+    yield env.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+    for _ in range(steps):
+        actions = np.where(rng.random(env.num_envs) < 0.9, GO, rng.integers(3, size=env.num_envs))
+        actions[0] = STOP  # its episodes end by the time limit
+        _, _, terminated, truncated, _ = step = env.step(actions)
+        yield step
+        over = terminated | truncated
+        if env.metadata["autoreset_mode"] is AutoresetMode.DISABLED and over.any():
+            yield env.reset(options={"reset_mask": over})
+
+
+@pytest.mark.parametrize(("decision_s", "steps"), [(None, 200), (0.3, 70)])
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_each_mode_is_gymnasiums_own(mode: AutoresetMode, decision_s: float | None, steps: int) -> None:
+    """Observations, rewards, ends and infos with their masks, field by field."""
+    task = TASK | {"decision_s": decision_s}
+    ours = gymnasium.make_vec(ENV_ID, num_envs=3, autoreset_mode=mode.value, **task)
+    theirs = SyncVectorEnv([lambda: SceneEnv(backend="traci", **task)] * 3, autoreset_mode=mode)
+    assert isinstance(ours, SceneVectorEnv)
+    assert ours.metadata["autoreset_mode"] is mode
+    assert ours.observation_space == theirs.observation_space
+    outcomes: Counter[str] = Counter()
+    with closing(ours), closing(theirs):
+        for mine, expected in zip(drive(ours, steps, seed=20), drive(theirs, steps, seed=20), strict=True):
+            for value, other in zip(mine, expected, strict=True):
+                assert_infos_equal(value, other)
+            assert mine[0] in ours.observation_space
+            outcomes.update(mine[-1].get("final_info", mine[-1])["outcome"])
+    assert outcomes.keys() >= {"success", "collision", "timeout"}
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_statistics_of_episodes_are_sums_over_their_steps(mode: AutoresetMode) -> None:
+    env = RecordEpisodeStatistics(SceneVectorEnv(3, autoreset_mode=mode, **TASK))
+    lengths, returns = np.zeros(3, int), np.zeros(3)
+    recorded = 0
+    was_over = np.zeros(3, bool)
+    with closing(env):
+        for _, *rewards_and_ends, infos in drive(env, 250, seed=1):
+            if not rewards_and_ends:  # a reset
+                was_over[:] = False
+                continue
+            rewards, terminated, truncated = rewards_and_ends
+            steps = ~was_over  # the step after the end only resets
+            assert not rewards[was_over].any()
+            lengths[steps] += 1
+            returns[steps] += rewards[steps]
+            over = terminated | truncated
+            for index in np.flatnonzero(over):
+                assert infos["episode"]["l"][index] == lengths[index]
+                assert infos["episode"]["r"][index] == pytest.approx(returns[index])
+                lengths[index] = returns[index] = 0
+                recorded += 1
+            was_over = over & (mode is AutoresetMode.NEXT_STEP)
+    assert recorded > 6
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_a_snapshot_may_be_taken_where_an_episode_has_ended(mode: AutoresetMode) -> None:
+    """Within a decision, so that the other environments have gone on."""
+    task = TASK | {"autoreset_mode": mode, "decision_s": 0.7}
+
+    def go_on(env: SceneVectorEnv, over: Any) -> list[Any]:
+        returned: list[Any] = [env.reset(options={"reset_mask": over})] if mode is AutoresetMode.DISABLED else []
+        return [*returned, *(env.step(np.full(4, GO)) for _ in range(3))]
+
+    with closing(SceneVectorEnv(4, **task)) as env:
+        env.reset(seed=3)
+        over = np.zeros(4, bool)
+        while not over.any():
+            observation, _, terminated, truncated, _ = env.step(np.array([GO, GO, GO, STOP]))
+            over = terminated | truncated
+        assert not over.all()
+        snapshots = env.snapshot()
+        went_on = go_on(env, over)
+    with closing(SceneVectorEnv(4, **task)) as other:
+        assert_infos_equal(other.restore(snapshots)[0], observation)
+        for before, after in zip(went_on, go_on(other, over), strict=True):
+            for first, second in zip(before, after, strict=True):
+                assert_infos_equal(first, second)
+
+
+def test_without_autoreset_ended_episodes_take_no_step() -> None:
+    with closing(SceneVectorEnv(2, autoreset_mode="Disabled", time_limit_s=0.2)) as env:
+        env.reset(seed=0)
+        env.step(np.array([GO, GO]))
+        env.step(np.array([GO, GO]))
+        with pytest.raises(InputError, match=r"episodes of environments 0, 1 have ended; reset them with .*reset_mask"):
+            env.step(np.array([GO, GO]))
+        env.reset(options={"reset_mask": np.array([False, True])})
+        with pytest.raises(InputError, match="episodes of environments 0 have ended"):
+            env.step(np.array([GO, GO]))
+        env.reset()
+        env.step(np.array([GO, GO]))
+
+
+@pytest.mark.parametrize("mask", [[True], [1, 0], [False, False], [[True, False]], "yes"])
+def test_a_reset_mask_has_a_boolean_for_each_environment(mask: Any) -> None:
+    with closing(SceneVectorEnv(2)) as env:
+        env.reset(seed=0)
+        with pytest.raises(InputError, match="reset_mask must be 2 booleans, one for each environment"):
+            env.reset(options={"reset_mask": np.array(mask)})
+
+
+def test_an_unknown_mode_is_refused() -> None:
+    with pytest.raises(InputError, match="unknown autoreset_mode 'never'; choose one of 'NextStep', 'SameStep', 'Dis"):
+        SceneVectorEnv(2, autoreset_mode="never")

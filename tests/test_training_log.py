@@ -1,19 +1,24 @@
 """TensorBoard logs of trainings, read back as TensorBoard reads them."""
 
 import io
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.metadata import PLUGIN_NAME
 
+from tint_sumo.cli import main
 from tint_sumo.config import PolicySettings, PpoSettings, TraitSettings
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.progress import Progress
+from tint_sumo.scenes import find_scene
+from tint_sumo.structures import plain as plain_of
 from tint_sumo.study.training import train_policy
-from tint_sumo.study.training_films import film_policy
 from tint_sumo.traits.training import train
 
 SMALL = PolicySettings((8,), (8,), 8, (8,), 8, (8,))
@@ -42,15 +47,24 @@ def test_a_policy_s_log_holds_outcomes_settings_and_a_film_of_every_kept_policy(
     assert log.PluginTagToContent(PLUGIN_NAME), "TensorBoard's tab of hyperparameters has something to show"
 
 
-def test_films_change_no_weight_and_are_gifs_of_one_case(tmp_path: Path) -> None:
-    """The films of a training that holds libsumo run through TraCI."""
-    plain = train_policy("oracle", 0.4, 128, 0, tmp_path / "plain", settings=TINY)
-    filmed = train_policy("oracle", 0.4, 128, 0, tmp_path / "filmed", settings=TINY, film=film_policy)
-    assert plain.read_bytes() == filmed.read_bytes()
-    films = read(tmp_path / "filmed").Images("film")
+def test_the_command_line_films_a_training_and_gives_the_policy_that_python_gives(tmp_path: Path) -> None:
+    """The films of a training that holds libsumo run through TraCI. Threads are those of a usual Python."""
+    torch.set_num_threads(2)
+    try:
+        scene = replace(find_scene("t_intersection"), time_limit_s=2.0)
+        plain = train_policy("oracle", 0.4, 256, 0, tmp_path / "plain", settings=TINY, scene=scene)
+    finally:
+        torch.set_num_threads(1)
+    config = tmp_path / "train.yaml"
+    settings = {"method": "oracle", "p_conservative": 0.4, "steps": 256, "scene": {"time_limit_s": 2.0}}
+    config.write_text(json.dumps({**settings, "budget": plain_of(TINY)}))
+    out = tmp_path / "filmed"
+    assert main(["policy", "train", "--config", str(config), "--out", str(out)]) == 0
+    assert (out / "policy.safetensors").read_bytes() == plain.read_bytes()
+    films = read(out).Images("film")
     assert len(films) == 3
     with Image.open(io.BytesIO(films[-1].encoded_image_string)) as film:
-        assert film.format == "GIF" and getattr(film, "n_frames", 1) > 20
+        assert film.format == "GIF" and getattr(film, "n_frames", 1) == 21
 
 
 def test_an_interrupted_training_goes_on_with_the_same_curves(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from tests.simulation.scenes import T
 from tests.study import runs
 from tint_sumo import traits
 from tint_sumo.config import PpoSettings, TraitSettings
+from tint_sumo.determinism import preserved_random_state
 from tint_sumo.errors import InputError
 from tint_sumo.policy import ClassifierTraits, EncoderTraits, OracleTraits, RecurrentPPO, StreamingTraits
 from tint_sumo.policy.network import GruPolicy
@@ -205,18 +207,55 @@ def test_a_run_may_be_interrupted_again_and_again(tmp_path: Path, brief: PpoSett
     assert pd.read_csv(tmp_path / CURVE_FILE)["decisions"].tolist() == [64, 128, 192, 256]
 
 
+def look(policy: Path) -> None:
+    """Look at a policy as films do, and draw random numbers of all kinds."""
+    load_policy(policy)
+    draw()
+
+
+def draw(_: object = None) -> tuple[float, float, float]:
+    return random.random(), float(np.random.random()), float(torch.rand(1))  # noqa: NPY002 - the global ones
+
+
 @pytest.mark.parametrize("method", ["oracle", "vae", "streaming_critic"])
 def test_an_interrupted_run_ends_with_the_very_same_policy(method: str, tmp_path: Path, tiny: PpoSettings) -> None:
-    """Episodes of 10 s are 25 decisions, and end within rollouts of 16; traits are inferred after 5 decisions."""
+    """Whoever looks on. Policies are kept, and looked at, after 128 and 256 decisions: between the interruptions.
+
+    Episodes of 10 s are 25 decisions, and end within rollouts of 16; traits are inferred after 5 decisions.
+    """
     settings = replace(tiny, time_limit_s=10.0)
     at_a_stretch, resumed = tmp_path / "at_a_stretch", tmp_path / "resumed"
-    train_policy(method, (0.1, 0.9), 512, 0, at_a_stretch, settings=settings)
-    for steps in (128, 320):
+    train = partial(train_policy, method, (0.1, 0.9), 512, 0, settings=settings)
+    train(at_a_stretch)
+    for steps in (128, 192, 320):
         with pytest.raises(KeyboardInterrupt):
-            train_policy(method, (0.1, 0.9), 512, 0, resumed, settings=settings, report=interrupt_at(steps))
+            train(resumed, report=interrupt_at(steps), film=look)
         torch.manual_seed(steps)  # another process has other random numbers
-    train_policy(method, (0.1, 0.9), 512, 0, resumed, settings=settings)
+    train(resumed, report=draw, film=look)
     assert_same_training(resumed, at_a_stretch)
+
+
+def test_a_training_leaves_the_random_numbers_and_threads_of_the_process_alone(
+    tmp_path: Path, tiny: PpoSettings, encoders: Path
+) -> None:
+    with preserved_random_state():
+        expected = draw()
+    torch.set_num_threads(2)
+    try:
+        train_policy("vae", 0.4, 64, 0, tmp_path, settings=tiny, traits=encoders / "vae.safetensors", film=look)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
+    assert draw() == expected
+
+
+def test_policies_are_loaded_without_random_numbers(tmp_path: Path, tiny: PpoSettings) -> None:
+    policy = train_policy("oracle", 0.4, 64, 0, tmp_path, settings=tiny, with_zip=True)
+    with preserved_random_state():
+        expected = draw()
+    load_policy(policy)
+    load_policy(tmp_path / ZIP_FILE, allow_pickle=True)
+    assert draw() == expected
 
 
 def test_a_run_meets_no_case_of_the_tests(tmp_path: Path, tiny: PpoSettings, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tests.simulation.scenes import T
-from tint_sumo.config import TraitSettings
+from tint_sumo.config import CONSERVATIVE_LABEL, TraitSettings
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_labels, load_windows, split_by_episode
 from tint_sumo.errors import InputError
@@ -61,15 +61,31 @@ def test_training_sees_the_training_episodes_only(
     }
 
 
+def test_a_method_with_labels_is_told_who_is_conservative(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[Windows, np.ndarray]] = []
+    original = trait_models.train
+
+    def train(windows: Windows, *args: Any, conservative: np.ndarray, **kwargs: Any) -> Any:
+        told.append((windows, conservative))
+        return original(windows, *args, conservative=conservative, **kwargs)
+
+    monkeypatch.setattr(trait_models, "train", train)
+    train_traits(dataset, tmp_path / "run", method="classifier", settings=SMALL, seed=SEED)
+    ((windows, conservative),) = told
+    np.testing.assert_array_equal(conservative, load_labels(dataset, windows) == CONSERVATIVE_LABEL)
+
+
 def test_evaluation_and_pictures_take_the_episodes_left_out_by_the_model_s_seed(
     dataset: Path, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn: list[np.ndarray] = []
+    drawn: list[tuple[np.ndarray, np.ndarray]] = []
     original = trait_models.plot_latents
 
-    def plot(model: Any, windows: Windows, *args: Any, **kwargs: Any) -> None:
-        drawn.append(windows.episode)
-        original(model, windows, *args, **kwargs)
+    def plot(model: Any, windows: Windows, conservative: np.ndarray, *args: Any, **kwargs: Any) -> None:
+        drawn.append((windows.episode, conservative))
+        original(model, windows, conservative, *args, **kwargs)
 
     monkeypatch.setattr(trait_models, "plot_latents", plot)
     files = plot_traits(dataset, model, tmp_path)
@@ -79,8 +95,10 @@ def test_evaluation_and_pictures_take_the_episodes_left_out_by_the_model_s_seed(
     windows = load_windows(dataset)
     _, test = split_by_episode(windows, TEST_FRACTION, SEED)
     assert found["windows"] == len(test)
-    np.testing.assert_array_equal(drawn[0], windows.episode[test])
+    ((episode, conservative),) = drawn
     labels = load_labels(dataset, windows)[test]
+    np.testing.assert_array_equal(episode, windows.episode[test])
+    np.testing.assert_array_equal(conservative, labels == CONSERVATIVE_LABEL)
     assert max(labels.mean(), 1 - labels.mean()) - 0.05 <= found["accuracy"] <= 1.0
 
 

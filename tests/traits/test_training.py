@@ -7,6 +7,7 @@ import torch
 
 from tint_sumo.errors import InputError
 from tint_sumo.traits import TRAIT_METHODS, load, training
+from tint_sumo.traits.classifier import Classifier
 from tint_sumo.traits.evaluation import evaluate
 from tint_sumo.traits.training import CHECKPOINT_FILE, train
 from tint_sumo.traits.vae import Vae
@@ -118,6 +119,20 @@ def test_progress_is_told_in_windows_with_the_loss(windows, small, tmp_path):
     assert told[-1].measures == {"loss": pytest.approx(card["loss"]["total"])}
 
 
+def test_the_learning_rate_decays_linearly_to_zero(windows, small, tmp_path, monkeypatch):
+    rates = []
+    original = torch.optim.Adam.step
+
+    def step(self, *args, **kwargs):
+        rates.append(self.param_groups[0]["lr"])
+        return original(self, *args, **kwargs)
+
+    monkeypatch.setattr(torch.optim.Adam, "step", step)
+    train(windows, replace(small, epochs=2), tmp_path)
+    count = 2 * -(-len(windows.length) // small.batch_size)
+    assert rates == pytest.approx([small.learning_rate * (1.0 - number / count) for number in range(count)])
+
+
 def test_large_networks_train_in_bfloat16(windows, small, tmp_path):
     settings = replace(small, hidden_size=training.BFLOAT16_HIDDEN_SIZE, epochs=1)
     model = train(windows, settings, tmp_path)
@@ -131,6 +146,10 @@ def test_two_populations_separate(small, tmp_path, method):
     settings = replace(small, hidden_size=16, learning_rate=1e-2, epochs=8)
     model = train(windows, settings, tmp_path, method=method, conservative=labels)
     assert evaluate(model, windows, slow).accuracy > 0.95
+    if isinstance(model, Classifier):
+        mean, _ = model.encode(torch.from_numpy(windows.states), torch.from_numpy(windows.length))
+        predicted = model.logit(mean).numpy() > 0.0
+        assert (predicted == slow).mean() > 0.95, "positive log-odds are those of the drivers with a true label"
 
 
 def test_only_the_classifier_gets_labels(windows, small, tmp_path):

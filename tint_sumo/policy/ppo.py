@@ -25,6 +25,7 @@ from tint_sumo.config import PpoSettings
 from tint_sumo.errors import InputError
 from tint_sumo.files import whole_file
 from tint_sumo.policy.buffer import SequenceBuffer, Sequences, buffer_class
+from tint_sumo.policy.loss import Decisions, ppo_loss
 from tint_sumo.policy.network import GruPolicy
 
 _DEFAULTS = PpoSettings()
@@ -219,24 +220,19 @@ class RecurrentPPO(OnPolicyAlgorithm):
         values, log_probs, entropies = self.policy.evaluate_actions(
             batch.observations, batch.actions, batch.states, batch.episode_starts
         )
-        log_ratio = log_probs - batch.log_probs
-        ratio = log_ratio.exp()
-        clipped = ratio.clamp(1.0 - self.clip_range, 1.0 + self.clip_range)
-        policy_loss = -torch.minimum(batch.advantages * ratio, batch.advantages * clipped).mean()
-        value_loss = nn.functional.mse_loss(values.flatten(), batch.returns)
-        entropy = (-log_probs if entropies is None else entropies).mean()
-        loss = policy_loss - self.ent_coef * entropy + self.vf_coef * value_loss
+        decisions = Decisions(log_probs, batch.log_probs, batch.advantages, values.flatten(), batch.returns, entropies)
+        loss = ppo_loss(decisions, clip_range=self.clip_range, ent_coef=self.ent_coef, vf_coef=self.vf_coef)
         self.policy.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.total.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         self.policy.optimizer.step()
         return {
-            "loss": loss.item(),
-            "policy_gradient_loss": policy_loss.item(),
-            "value_loss": value_loss.item(),
-            "entropy_loss": -entropy.item(),
-            "approx_kl": (ratio - 1.0 - log_ratio).mean().item(),
-            "clip_fraction": ((ratio - 1.0).abs() > self.clip_range).float().mean().item(),
+            "loss": loss.total.item(),
+            "policy_gradient_loss": loss.policy.item(),
+            "value_loss": loss.value.item(),
+            "entropy_loss": -loss.entropy.item(),
+            "approx_kl": loss.approx_kl.item(),
+            "clip_fraction": loss.clip_fraction.item(),
         }
 
     def learn(

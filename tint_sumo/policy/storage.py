@@ -14,6 +14,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from tint_sumo.config import PolicySettings
+from tint_sumo.determinism import preserved_random_state
 from tint_sumo.envs.episodes import observation_space
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, whole_file, write_json
@@ -56,7 +57,8 @@ def load_policy_network(stem: Path) -> GruPolicy:
     """
     network = read_policy_card(stem)[_NETWORK]
     try:
-        policy = _build(network)
+        with preserved_random_state():
+            policy = _build(network)
     except (LookupError, TypeError, ValueError, AttributeError, MemoryError, RuntimeError) as error:
         raise InputError(f"{card_file(stem)}: unusable network ({error!r}); restore the file") from None
     try:

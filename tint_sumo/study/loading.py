@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits
 from tint_sumo.config import LATENT_SIZE, Share, ends, is_share
+from tint_sumo.determinism import preserved_random_state
 from tint_sumo.errors import InputError, refuse_old_name
 from tint_sumo.files import shipped
 from tint_sumo.policy import RecurrentPPO, TraitSource
@@ -128,7 +129,8 @@ def _load_zip(file: Path, allow_pickle: bool) -> RecurrentPPO:
             "or --allow-pickle if you trust the file"
         )
     print(f"reading {file}, a pickle: it can run any code", file=sys.stderr)
-    return RecurrentPPO.load(file)
+    with preserved_random_state():
+        return RecurrentPPO.load(file)
 
 
 def _contender(stem: Path, policy: Any) -> Contender:

@@ -10,7 +10,7 @@ import pandas as pd
 import torch
 
 from tint_sumo import traits
-from tint_sumo.config import CONSERVATIVE_LABEL, TraitSettings
+from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, joined, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.executors import Job, Workers, executor_of
@@ -24,6 +24,7 @@ from tint_sumo.structures import Many
 from tint_sumo.study.budgets import TRAIT_BUDGETS
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.tables import markdown_table
+from tint_sumo.study.trait_models import first_of_two
 from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, fit_line
 from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.training import train
@@ -158,7 +159,7 @@ class TransferJob:
             self.out / self.outputs[0],
             method=self.method,
             seed=self.seed,
-            conservative=labels == CONSERVATIVE_LABEL if find_trait_method(self.method).uses_labels else None,
+            conservative=first_of_two(labels, self.method) if find_trait_method(self.method).uses_labels else None,
             report=report,
             card={"data": {"scenes": list(self.trained_on), "windows": len(windows)}},
         )

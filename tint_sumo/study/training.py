@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits as trait_models
 from tint_sumo.config import LATENT_SIZE, PpoSettings, Share, ends, require_share
+from tint_sumo.determinism import preserved_random_state, single_threaded
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file, write_text
@@ -73,6 +74,9 @@ def train_policy(
     episodes by decisions), a TensorBoard log and, where the method infers traits, its trait model. An interrupted run
     leaves a checkpoint, and the same call goes on from there. A finished run is not repeated.
 
+    The policy follows from the arguments alone: the training computes in one thread, nobody who looks on changes its
+    random numbers, and the process's own are as before when it ends.
+
     Args:
         method: name of a learned method.
         p_conservative: share of conservative drivers it trains among; a range: each episode draws its own. None in a
@@ -115,6 +119,9 @@ def train_policy(
         "settings": asdict(settings),
         "traits": None if encoder is None else digest(encoder),
     }
+    # The training draws from the global random numbers: those who look on must not.
+    report = preserved_random_state()(report)
+    film = None if film is None else preserved_random_state()(film)
     stem = snapshot_stem(out, 100)
     with claim_folder(out, identity, with_versions=False):  # the card has them
         if with_zip and card_file(stem).exists() and not (out / ZIP_FILE).exists():
@@ -125,7 +132,8 @@ def train_policy(
             card = _card(identity, encoder)
             venv = training_venv(learned, encoder, p_conservative, settings, scene)
             try:
-                model = _learn(venv, steps, seed, out, settings, card, film, report)
+                with preserved_random_state(), single_threaded():
+                    model = _learn(venv, steps, seed, out, settings, card, film, report)
             finally:
                 venv.close()
             if with_zip:

@@ -111,7 +111,7 @@ def _train(
         method=method,
         seed=seed,
         latent_size=latent_size,
-        conservative=_first_of_two(load_labels(data, windows), method) if uses_labels else None,
+        conservative=first_of_two(load_labels(data, windows), method) if uses_labels else None,
         report=report,
         card={"data": describe(data)},
     )
@@ -177,7 +177,7 @@ def _load_for_test(
     return trained, windows, load_labels(data, windows), int(read_card(model).get("seed", 0))
 
 
-def _first_of_two(labels: NDArray[np.int64], method: str) -> NDArray[np.bool_]:
+def first_of_two(labels: NDArray[np.int64], method: str) -> NDArray[np.bool_]:
     """Which drivers are of the first of two kinds: conservative, or of the first vType."""
     kinds = np.unique(labels)
     if len(kinds) != 2:

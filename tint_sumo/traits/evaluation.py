@@ -84,7 +84,7 @@ class Probe:
         self._model, self._noise_m, self._seed = model, noise_m, seed
         mean = encode_windows(model, windows, noise_m=noise_m, seed=seed).mean
         reference = np.random.default_rng(seed).permutation(len(mean))[:KNN_REFERENCES]
-        self._linear: Pipeline = make_pipeline(StandardScaler(), LinearSVC()).fit(mean, labels)
+        self._linear: Pipeline = make_pipeline(StandardScaler(), LinearSVC(random_state=0)).fit(mean, labels)
         neighbours = KNeighborsClassifier(min(NEIGHBOURS, len(reference)))
         self._nearest: Pipeline = make_pipeline(StandardScaler(), neighbours)
         self._nearest.fit(mean[reference], labels[reference])

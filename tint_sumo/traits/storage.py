@@ -9,6 +9,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 
 from tint_sumo.config import TraitSettings
+from tint_sumo.determinism import preserved_random_state
 from tint_sumo.errors import InputError, refuse_old_name
 from tint_sumo.files import read_json, shipped, whole_file, write_json
 from tint_sumo.traits.model import TRAIT_METHODS, TraitModel
@@ -123,7 +124,8 @@ def _build(card: Mapping[str, Any], stem: Path) -> TraitModel:
         key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"].items()
     }
     try:
-        return TRAIT_METHODS[card["method"]](TraitSettings(**settings), card["latent_size"])
+        with preserved_random_state():
+            return TRAIT_METHODS[card["method"]](TraitSettings(**settings), card["latent_size"])
     except (TypeError, ValueError, RuntimeError, IndexError) as error:
         raise InputError(
             f"{_card_file(stem)}: unusable settings ({error}); restore the file or train the model again"

@@ -15,6 +15,7 @@ from torch import nn
 from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.dataset.window_file import WindowFile
 from tint_sumo.dataset.windows import Windows
+from tint_sumo.determinism import preserved_random_state, single_threaded
 from tint_sumo.errors import InputError
 from tint_sumo.files import claim_folder, whole_file
 from tint_sumo.progress import Progress, Report, silent
@@ -44,7 +45,7 @@ def train(
     """Train ``method`` on all of ``windows`` and write model.safetensors and model.json into ``out``.
 
     An interrupted run leaves a checkpoint; the same call continues it and ends with the very weights of a run without
-    interruption (on the same machine and number of threads). A finished run is loaded, not repeated.
+    interruption (on the same machine). A finished run is loaded, not repeated. It computes in one thread.
 
     Args:
         windows: training windows only; the caller keeps the test episodes out.
@@ -80,13 +81,14 @@ def train(
     with claim_folder(out, identity):
         if (out / f"{RUN_MODEL}.json").exists():
             return load(out / f"{RUN_MODEL}.safetensors")  # the folder alone could be the name of a shipped model
-        with torch.random.fork_rng(devices=[]):
+        with preserved_random_state():
             torch.manual_seed(_stream_seed(seed, 0))
             model = model_type(settings, latent_size)
         labels = None if conservative is None else torch.from_numpy(conservative)
         data = TrainingWindows(windows, labels, with_other=model_type.uses_other_window)
         run = _Run(model, data, settings, seed)
-        loss = run.fit(out, report)
+        with single_threaded():
+            loss = run.fit(out, report)
 
         known = {key: identity[key] for key in ("seed", "windows", "windows_sha256")}
         save(model, out / RUN_MODEL, {**known, "loss": loss, **(card or {})})

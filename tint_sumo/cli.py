@@ -32,6 +32,7 @@ from tint_sumo.configuration import (
     write_command,
 )
 from tint_sumo.errors import InputError, JobError
+from tint_sumo.percentages import percent
 from tint_sumo.processes import end_quickly, interrupt_on_sigterm
 from tint_sumo.provenance import Origin, made_by
 from tint_sumo.redaction import redact
@@ -329,9 +330,13 @@ class EvaluateTraits(Command):
         found = evaluate_traits(self.data, self.model, noise_m=self.noise, other_scene=self.other_scene)
         parts = {**found["by_length"], **found["by_leader"]}
         lines = [
-            f"linear SVC         {found['accuracy']:8.3%} of {found['windows']} windows",
-            f"nearest neighbours {found['knn_accuracy']:8.3%}",
-            *(f"  {_part_name(name):16} {part['accuracy']:8.3%}" for name, part in parts.items() if part["windows"]),
+            f"linear SVC         {percent(found['accuracy'], 3):>7}% of {found['windows']} windows",
+            f"nearest neighbours {percent(found['knn_accuracy'], 3):>7}%",
+            *(
+                f"  {_part_name(name):16} {percent(part['accuracy'], 3):>7}%"
+                for name, part in parts.items()
+                if part["windows"]
+            ),
         ]
         if found["error_m"] is not None:
             lines.append(f"position error     {found['error_m']:8.4f} m (root mean square)")
@@ -526,8 +531,9 @@ class EvaluatePolicy(SpreadCommand):
                 evaluation = evaluate_on(workers, self.model, contender, world, self.episodes, self.seed, **given)
         rates = {outcome: evaluation.rate(outcome) for outcome in OUTCOMES}
         lines = [
-            f"{outcome:9} {rate.value:6.1%}  (95 % interval {rate.interval[0]:.1%} to {rate.interval[1]:.1%})"
+            f"{outcome:9} {percent(rate.value):>5}%  (95 % interval {low}% to {high}%)"
             for outcome, rate in rates.items()
+            for low, high in (map(percent, rate.interval),)
         ]
         time_s = evaluation.navigation_time_s
         lines.append("no success" if time_s is None else f"navigation time {time_s:.1f} s")

@@ -8,6 +8,8 @@ from typing import Any, NoReturn
 
 from tqdm import tqdm
 
+from tint_sumo.percentages import percent
+
 TERMINAL_INTERVAL_S = 0.1
 LOG_INTERVAL_S = 60.0  # every refresh of what cannot be redrawn in place is one more line
 _SHARES = ("success", "timeout", "collision", "accuracy")  # measures that people read in percent
@@ -25,7 +27,9 @@ class Progress:
     @property
     def outcomes(self) -> str:
         """The measures for people to read."""
-        shown = (f"{value:.0%}" if name in _SHARES else f"{value:.3g}" for name, value in self.measures.items())
+        shown = (
+            f"{percent(value, 0)}%" if name in _SHARES else f"{value:.3g}" for name, value in self.measures.items()
+        )
         return ", ".join(f"{name} {value}" for name, value in zip(self.measures, shown, strict=True))
 
 

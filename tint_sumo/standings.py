@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from tint_sumo.percentages import percent
 from tint_sumo.progress import Progress
 
 
@@ -74,7 +75,7 @@ class Standing:
             return Words()
         left_s = self.left_s(now_s)
         return Words(
-            f"{self.last.done / self.last.total:.0%}",
+            f"{percent(self.last.done / self.last.total, 0)}%",
             "" if left_s is None else f"{_rounded(self.speed)} {self.last.unit}s/s",
             "" if left_s is None else duration(left_s),
             self.last.outcomes,

@@ -84,6 +84,12 @@ def test_the_paper_s_success_is_marked_where_there_is_one(tmp_path: Path, drawn:
     assert sorted(entries) == sorted([*OUTCOMES, "95 % interval of success", "success in the paper"])
 
 
+def test_no_label_of_a_bar_rounds_to_all_or_to_the_even_number(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    rows = tabulate([given("ttc", {Conditions(0.25): (199, 1, 0), Conditions(0.4): (197, 3, 0)})])
+    plot_bars(rows, tmp_path / "bars.png")
+    assert [text.get_text() for axes in drawn().axes for text in axes.texts] == ["99.5", "98.5"]
+
+
 def test_a_single_bar_is_a_figure_too(tmp_path: Path) -> None:
     rows = tabulate([given("always_go", {Conditions(0.4): (0, 0, 3)})])
     assert_picture(plot_bars(rows, tmp_path / "bars.png"))
@@ -109,7 +115,8 @@ def test_every_method_has_a_curve_of_its_own_look(tmp_path: Path, drawn: Callabl
     curves = {name: [curve(0.2, 0.4)] for name in METHODS}
     assert_picture(plot_curves(curves, tmp_path / "curves.png"))
     lines = drawn().axes[0].get_lines()
-    assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(METHODS)
+    looks = [(line.get_color(), line.get_marker(), line.get_linestyle()) for line in lines]
+    assert looks == [(one.look.colour, one.look.marker, one.look.dash) for one in METHODS.values()]
 
 
 def test_worlds_have_a_panel_for_each_condition_through_the_training_s_world(
@@ -122,6 +129,8 @@ def test_worlds_have_a_panel_for_each_condition_through_the_training_s_world(
     assert shown[1] == [[0.7, 1.0, 1.5]] * 2
     assert shown[2] == [[100], [25, 50, 100]], "a rule has no training to be cut short"
     assert [container.get_label() for container in noise.containers] == ["time to collision", "oracle"]
+    colours = [container.lines[0].get_color() for axes in (noise, tau, percent) for container in axes.containers]
+    assert colours == [METHODS[name].look.colour for name in ("ttc", "oracle")] * 3
 
 
 def test_methods_of_the_past_are_drawn_under_their_names(tmp_path: Path, drawn: Callable[[], Figure]) -> None:

@@ -9,7 +9,17 @@ from tint_sumo.errors import RENAMED_METHODS, InputError
 from tint_sumo.policy import ClassifierTraits, EncoderTraits, NoTraits, OracleTraits, StreamingTraits
 from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.study.loading import load_policy
-from tint_sumo.study.methods import METHODS, Learned, Rule, find_learned, find_method, register
+from tint_sumo.study.methods import (
+    METHODS,
+    Learned,
+    Look,
+    Rule,
+    find_learned,
+    find_method,
+    look_of,
+    look_of_encoder,
+    register,
+)
 from tint_sumo.study.rules import AlwaysGo
 from tint_sumo.traits import TraitModel
 
@@ -79,6 +89,50 @@ def test_rules_act() -> None:
         if isinstance(method, Rule):
             actions, _ = method.make(T_INTERSECTION).predict(observation)
             assert actions.shape == (3,)
+
+
+# Linear RGB as people see it without red cones, and without green ones (Machado, Oliveira and Fernandes 2009).
+SIGHTS = {
+    "full": np.eye(3),
+    "protanopia": np.array(
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+    ),
+    "deuteranopia": np.array(
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]]
+    ),
+}
+XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def linear_rgb(colours: list[str]) -> np.ndarray:
+    rgb = np.array([[int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)] for colour in colours])
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+
+
+def cie_lab(linear: np.ndarray) -> np.ndarray:
+    x, y, z = np.cbrt(np.clip(linear @ XYZ.T / XYZ.sum(axis=1), 1e-4, None)).T
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=1)
+
+
+@pytest.mark.parametrize(("sight", "least"), [("full", 30), ("protanopia", 15), ("deuteranopia", 15)])
+def test_colours_of_methods_are_far_apart_with_and_without_all_cones(sight: str, least: float) -> None:
+    seen = cie_lab(np.clip(linear_rgb([method.look.colour for method in METHODS.values()]) @ SIGHTS[sight].T, 0, 1))
+    apart = np.linalg.norm(seen[:, None] - seen, axis=2)[np.triu_indices(len(METHODS), 1)]
+    assert apart.min() > least  # what people barely notice is 2.3
+
+
+def test_methods_can_be_told_apart_without_colours_and_seen_on_white_and_on_black() -> None:
+    looks = [method.look for method in METHODS.values()]
+    assert len({look.marker for look in looks}) == len({look.colour for look in looks}) == len(METHODS)
+    luminance = linear_rgb([look.colour for look in looks]) @ XYZ[1]
+    assert (1.05 / (luminance + 0.05) > 3).all()  # WCAG's least contrast of graphics, on white
+    assert ((luminance + 0.05) / (linear_rgb(["#16181b"]) @ XYZ[1] + 0.05) > 3).all()  # and on the report's dark paper
+
+
+def test_trait_methods_look_like_the_policies_that_use_them() -> None:
+    for name, method in (("vae", "vae"), ("cross_window", "cross_window"), ("morton", "morton"), ("classifier", "ma")):
+        assert look_of_encoder(name) == METHODS[method].look
+    assert look_of_encoder("unknown") == look_of("unknown") == Look()
 
 
 @pytest.mark.parametrize("twin", [Rule("ttc", "another", lambda _: AlwaysGo()), Learned("ttc", "another", NoTraits)])

@@ -22,6 +22,7 @@ from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.driving import Moment, drive_case
 from tint_sumo.study.evaluation import Case, Evaluation
 from tint_sumo.study.loading import load_policy
+from tint_sumo.study.methods import METHODS
 from tint_sumo.study.page import write_page
 from tint_sumo.study.page.charts import curve_chart, outcome_chart, world_charts
 from tint_sumo.study.page.choosing import MOST_CASES, choose, choose_cases
@@ -196,6 +197,14 @@ def test_charts_and_their_tables_tell_the_rates_and_intervals() -> None:
     assert trace["x"][0] + trace["error_x"]["array"][0] == pytest.approx(100 * high, abs=0.01)
     assert trace["x"][0] - trace["error_x"]["arrayminus"][0] == pytest.approx(100 * low, abs=0.01)
     assert chart.lines[1:] == [["oracle", "0.4", "85.0", f"{100 * low:.1f} to {100 * high:.1f}"]]
+
+
+def test_a_method_has_one_colour_in_figures_and_on_the_page() -> None:
+    rows = tabulate([given(name, {Conditions(ALL_MIXES): (4, 0, 1)}) for name in METHODS])
+    rows += tabulate([given(name, {Conditions(ALL_MIXES, 0.1): (3, 0, 2)}) for name in METHODS])
+    (chart,) = world_charts(rows)
+    shown = [(trace["marker"]["color"], trace["line"]["color"]) for trace in chart.figure["data"]]
+    assert shown == [(method.look.colour, method.look.colour) for method in METHODS.values()]
 
 
 def test_worlds_have_a_chart_for_every_condition_that_varies() -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, write_json
+from tint_sumo.percentages import percent
 from tint_sumo.progress import Progress, Report
 from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.scenes import T_INTERSECTION, Scene
@@ -48,7 +49,7 @@ class CeilingJob:
             found[f"{p_conservative:g}"] = ceiling(p_conservative, episodes, CASES, self.scene)
             done += episodes
         write_json(self.out / CEILINGS_FILE, found)
-        return ", ".join(f"P {p}: {share:.1%}" for p, share in found.items())
+        return ", ".join(f"P {p}: {percent(share)}%" for p, share in found.items())
 
 
 def read_ceilings(out: Path) -> dict[float, float]:

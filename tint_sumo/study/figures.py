@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from tint_sumo.config import ends
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.files import whole_file
-from tint_sumo.study.methods import METHODS
+from tint_sumo.percentages import percent
+from tint_sumo.study.methods import METHODS, look_of
 from tint_sumo.study.policy_jobs import smoothed_percent
 from tint_sumo.study.rows import WORLDS, Row, by_title, varied
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
 INK = {"success": "white", "timeout": "black", "collision": "white"}  # colours of the numbers on these colours
-_MARKERS = "osD^vP*Xh<>"
 _PANELS = 3  # panels in a row
 
 
@@ -60,7 +60,7 @@ def _plot_panel(axes: Axes, rows: Sequence[Row]) -> None:
         for position, start, width in zip(positions, left, widths, strict=True):
             if width >= 8.0:  # thinner parts have no room for a number
                 text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "color": INK[outcome]}
-                axes.text(start + width / 2, position, f"{width:.0f}", **text)
+                axes.text(start + width / 2, position, percent(width / 100.0), **text)
         left = [start + width for start, width in zip(left, widths, strict=True)]
     ends_percent = 100.0 * np.array([row.intervals["success"] for row in rows]).T
     middle = np.array([100.0 * row.rate("success") for row in rows])
@@ -87,13 +87,11 @@ def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Pat
     """
     figure = Figure(figsize=(7.5, 4.6), dpi=150, layout="constrained")
     axes = figure.subplots()
-    for position, (method, seeds) in enumerate(curves.items()):
-        percent = smoothed_percent(seeds)
-        style = _line_style(position) | {"markevery": 0.12}
-        axes.plot(percent.index, percent.mean(axis=1), label=METHODS[method].title, **style)
-        axes.fill_between(
-            percent.index.to_numpy(), percent.min(axis=1), percent.max(axis=1), color=f"C{position}", alpha=0.12, lw=0
-        )
+    for method, seeds in curves.items():
+        success = smoothed_percent(seeds)
+        at, style = success.index.to_numpy(), _line_style(method) | {"markevery": 0.12}
+        axes.plot(at, success.mean(axis=1), label=METHODS[method].title, **style)
+        axes.fill_between(at, success.min(axis=1), success.max(axis=1), color=style["color"], alpha=0.12, lw=0)
     axes.set(xlabel="decisions", ylabel="success in training, all mixes (%)", ylim=(0, 100))
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize=8, ncols=2)
@@ -105,8 +103,8 @@ def plot_worlds(rows: Sequence[Row], file: Path) -> Path:
     figure = Figure(figsize=(11.0, 4.2), dpi=150, layout="constrained")
     all_axes = figure.subplots(1, 3, sharey=True)
     for axes, (name, title) in zip(all_axes, WORLDS.items(), strict=True):
-        for position, own in enumerate(by_title(rows).values()):
-            _plot_line(axes, own, name, position)
+        for own in by_title(rows).values():
+            _plot_line(axes, own, name)
         axes.set_xlabel(title)
         axes.grid(alpha=0.25)
     all_axes[0].set_ylabel("success, all mixes (%)")
@@ -115,18 +113,20 @@ def plot_worlds(rows: Sequence[Row], file: Path) -> Path:
     return _write(figure, file)
 
 
-def _plot_line(axes: Axes, rows: Sequence[Row], name: str, position: int) -> None:
+def _plot_line(axes: Axes, rows: Sequence[Row], name: str) -> None:
     if points := varied(rows, name):
         values = list(points)
-        percent = np.array([100.0 * points[value].rate("success") for value in values])
+        success = np.array([100.0 * points[value].rate("success") for value in values])
         limits = np.array([[100.0 * end for end in points[value].intervals["success"]] for value in values]).T
-        style = _line_style(position) | {"capsize": 2}
-        axes.errorbar(values, percent, yerr=np.abs(limits - percent), label=rows[0].title, **style)
+        style = _line_style(rows[0].method, is_open=rows[0].is_shipped) | {"capsize": 2}
+        axes.errorbar(values, success, yerr=np.abs(limits - success), label=rows[0].title, **style)
 
 
-def _line_style(position: int) -> dict[str, Any]:
-    """Lines differ in colour and marker."""
-    return {"color": f"C{position}", "marker": _MARKERS[position % len(_MARKERS)], "ms": 4, "lw": 1.2}
+def _line_style(method: str, *, is_open: bool = False) -> dict[str, Any]:
+    """Return Matplotlib's arguments for a method's line; open markers tell a shipped policy from a trained one."""
+    look = look_of(method)
+    style = {"color": look.colour, "marker": look.marker, "linestyle": look.dash, "ms": 4.5, "lw": 1.3}
+    return style | ({"markerfacecolor": "white"} if is_open else {})
 
 
 def _write(figure: Figure, file: Path) -> Path:

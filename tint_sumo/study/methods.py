@@ -35,12 +35,26 @@ class Policy(Protocol):
 
 
 @dataclass(frozen=True)
+class Look:
+    """How a method is drawn in every figure, in the report and in films.
+
+    Colours are of middling lightness, to be seen on white and on black, and far apart with each kind of colour
+    blindness. Markers and dashes differ, too.
+    """
+
+    colour: str = "#70757a"  # "#rrggbb"
+    marker: str = "o"  # Matplotlib's
+    dash: str = "-"  # Matplotlib's line style
+
+
+@dataclass(frozen=True)
 class Rule:
     """A hand-written policy."""
 
     name: str
     title: str  # name in tables and figures
     make: Callable[[AnyScene], Policy]
+    look: Look = Look()
 
 
 @dataclass(frozen=True)
@@ -54,6 +68,7 @@ class Learned:
     attention: bool = True
     critic_sees_true_traits: bool = False  # only in training; the policy itself never sees them
     trained_as: str | None = None  # the method whose training it shares, if it drives with other traits than it learnt
+    look: Look = Look()
 
     @property
     def sees_true_traits(self) -> bool:
@@ -112,14 +127,34 @@ def with_shared_trainings(names: Iterable[str]) -> list[str]:
     return list(dict.fromkeys([*shared, *(method.name for method in methods)]))
 
 
-register(Rule("always_go", "always go", lambda _: AlwaysGo()))
-register(Rule("ttc", "time to collision", lambda scene: TimeToCollision(scene=scene)))
-register(Learned("no_labels", "no labels", NoTraits))
-register(Learned("morton", "Morton", EncoderTraits, encoder="morton"))
-register(Learned("vae", "paper's method", EncoderTraits, encoder="vae"))
-register(Learned("no_attention", "paper's, no attention", EncoderTraits, encoder="vae", attention=False))
-register(Learned("cross_window", "cross-window", EncoderTraits, encoder="cross_window"))
-register(Learned("streaming", "streaming", StreamingTraits, encoder="cross_window"))
+def look_of(name: str) -> Look:
+    """Return how a method is drawn; in grey if nobody has registered it."""
+    return METHODS[name].look if name in METHODS else Look()
+
+
+def look_of_encoder(name: str) -> Look:
+    """Return how a trait method is drawn: as the first method that drives with its traits."""
+    users = (one for one in METHODS.values() if isinstance(one, Learned) and one.encoder == name)
+    return next((one.look for one in users), Look())
+
+
+register(Rule("always_go", "always go", lambda _: AlwaysGo(), look=Look("#646971", "o", ":")))
+register(Rule("ttc", "time to collision", lambda scene: TimeToCollision(scene=scene), look=Look("#8f9047", "s", ":")))
+register(Learned("no_labels", "no labels", NoTraits, look=Look("#1793fc", "D", "-")))
+register(Learned("morton", "Morton", EncoderTraits, encoder="morton", look=Look("#d77e0b", "^", "--")))
+register(Learned("vae", "paper's method", EncoderTraits, encoder="vae", look=Look("#197847", "v", "-")))
+register(
+    Learned(
+        "no_attention",
+        "paper's, no attention",
+        EncoderTraits,
+        encoder="vae",
+        attention=False,
+        look=Look("#ce1306", "P", "--"),
+    )
+)
+register(Learned("cross_window", "cross-window", EncoderTraits, encoder="cross_window", look=Look("#884bb5", "*", "-")))
+register(Learned("streaming", "streaming", StreamingTraits, encoder="cross_window", look=Look("#c0867a", "X", "-.")))
 register(
     Learned(
         "streaming_critic",
@@ -127,7 +162,10 @@ register(
         StreamingTraits,
         encoder="cross_window",
         critic_sees_true_traits=True,
+        look=Look("#fc329e", "h", "-."),
     )
 )
-register(Learned("ma", "Ma", ClassifierTraits, encoder="classifier", trained_as="oracle"))
-register(Learned("oracle", "oracle", OracleTraits))
+register(
+    Learned("ma", "Ma", ClassifierTraits, encoder="classifier", trained_as="oracle", look=Look("#15a1bb", "<", "--"))
+)
+register(Learned("oracle", "oracle", OracleTraits, look=Look("#5444fd", ">", "-")))

@@ -12,6 +12,7 @@ from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import write_json
+from tint_sumo.percentages import percent
 from tint_sumo.progress import Report, part_of
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, Scene, find_scene
 from tint_sumo.standings import Title
@@ -160,7 +161,7 @@ class EvaluateJob:
         scene_tau_s = find_scene(self.scene).tau_s
         result = Result(self.method, origin, self.mix, self.seed, tuple(tested), self.cases, scene_tau_s)
         write_json(self.result_file, result.to_json())
-        successes = ", ".join(f"{one.evaluation.rate('success').value:.1%}" for one in tested)
+        successes = ", ".join(f"{percent(one.evaluation.rate('success').value)}%" for one in tested)
         return f"success {successes}"
 
     def _meets(self, conditions: Conditions) -> bool:

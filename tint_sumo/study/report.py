@@ -10,6 +10,7 @@ from pathlib import Path
 from tint_sumo.config import share_words
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.files import write_text
+from tint_sumo.percentages import percent
 from tint_sumo.study.ceiling_job import read_ceilings
 from tint_sumo.study.figures import plot_bars, plot_curves, plot_worlds
 from tint_sumo.study.policy_jobs import read_curves
@@ -135,7 +136,7 @@ def _success_lines(rows: Sequence[Row], ceilings: Ceilings) -> Lines:
         cells = [_with_spread(own[p]) if p in own else "-" for p in mixes]
         lines.append([title, str(len(next(iter(own.values())).seeds)), *cells])
     if ceilings:
-        lines.append(["ceiling", "", *(_percent(ceilings.get(p), 1) or "-" for p in mixes)])
+        lines.append(["ceiling", "", *(percent(ceilings[p]) if p in ceilings else "-" for p in mixes)])
     paper = {_number(row): row.published["success"] for row in rows if row.method == "vae" and row.published}
     if paper:
         lines.append(["paper", "", *(f"{paper[p]:g}" if p in paper else "-" for p in mixes)])
@@ -202,7 +203,7 @@ def _world_lines(rows: Sequence[Row]) -> Lines:
     for title, own in by_title(rows).items():
         at = {row.conditions: row for row in own}
         cells = [
-            f"{100 * at[one].rate('success'):.1f} ({100 * at[one].rate('collision'):.1f})" if one in at else "-"
+            f"{percent(at[one].rate('success'))} ({percent(at[one].rate('collision'))})" if one in at else "-"
             for one in worlds
         ]
         lines.append([title, *cells])
@@ -219,15 +220,16 @@ def _mix(row: Row) -> str:
     return share_words(row.conditions.p_conservative)
 
 
-def _percent(share: float | None, digits: int = 2) -> str:
-    return "" if share is None else f"{100.0 * share:.{digits}f}"
+def _percent(share: float | None) -> str:
+    """Write a share for programs that read the table."""
+    return "" if share is None else f"{100.0 * share:.2f}"
 
 
 def _with_spread(row: Row) -> str:
-    spread, rate = row.spread("success"), 100 * row.rate("success")
-    return f"{rate:.1f}" if spread is None else f"{rate:.1f} ± {100 * spread:.1f}"
+    spread, rate = row.spread("success"), row.rate("success")
+    return percent(rate) + ("" if spread is None else f" ± {100 * spread:.1f}")
 
 
 def _with_interval(row: Row, outcome: str) -> str:
     low, high = row.intervals[outcome]
-    return f"{100 * row.rate(outcome):.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+    return f"{percent(row.rate(outcome))} [{percent(low)}, {percent(high)}]"

@@ -1,6 +1,6 @@
 """How trait models and policies fare in scenes they were not trained in."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,11 @@ from tint_sumo.dataset.windows import Windows, joined, load_drivers, load_labels
 from tint_sumo.executors import Job, Workers, executor_of
 from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import claim_folder, read_json, write_json, write_text
+from tint_sumo.percentages import percent
 from tint_sumo.progress import Report
 from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.scenes import SCENES, T_INTERSECTION
+from tint_sumo.scenes.geometry import Floats
 from tint_sumo.standings import Title
 from tint_sumo.structures import Many
 from tint_sumo.study.budgets import TRAIT_BUDGETS
@@ -140,16 +142,17 @@ class TransferJob:
         scenes = self.study.scenes
         model, probe = self._train(report)
         line = fit_line(model, *self._properties(self.trained_on, test=False))
-        rows = []
+        rows, words = [], []
         for scene in scenes:
             accuracy = probe.score(*self._labelled((scene,), test=True)).accuracy
             speed_r2 = float(line(*self._properties((scene,), test=True)))
             rows.append({"scene": scene, "accuracy": accuracy, "speed_r2": speed_r2})
+            words.append(f"{scene} {percent(accuracy, 2)}%")
         write_json(
             self._result_file,
             {"method": self.method, "trained_on": self._choice, "seed": self.seed, "scenes": rows},
         )
-        return ", ".join(f"{row['scene']} {row['accuracy']:.2%}" for row in rows)
+        return ", ".join(words)
 
     def _train(self, report: Report) -> tuple[traits.TraitModel, Probe]:
         windows, labels = self._labelled(self.trained_on, test=False)
@@ -202,19 +205,27 @@ def _report(out: Path) -> pd.DataFrame:
 def report_markdown(table: pd.DataFrame) -> str:
     """Accuracy and R2 by scene, means and standard deviations over the seeds."""
     return "\n".join(
-        f"## {title}\n\n{markdown_table(_lines(table.assign(value=scale * table[column])))}\n"
-        for column, title, scale in (
-            ("accuracy", "Accuracy of a linear classifier, %", 100.0),
-            ("speed_r2", "R2 of the desired speed, drivers without classes", 1.0),
+        f"## {title}\n\n{markdown_table(_lines(table, column, words))}\n"
+        for column, title, words in (
+            ("accuracy", "Accuracy of a linear classifier, %", _accuracy),
+            ("speed_r2", "R2 of the desired speed, drivers without classes", _r2),
         )
     )
 
 
-def _lines(table: pd.DataFrame) -> list[list[str]]:
+def _lines(table: pd.DataFrame, column: str, words: Callable[[Floats], str]) -> list[list[str]]:
     """A header, and a line for each model."""
     scenes = list(dict.fromkeys(table["scene"]))
     lines = [["method", "trained on", *scenes]]
     for (method, trained_on), rows in table.groupby(["method", "trained_on"], sort=False):
-        values = [rows.loc[rows["scene"] == scene, "value"].to_numpy() for scene in scenes]
-        lines.append([str(method), str(trained_on), *(f"{one.mean():.2f} ± {one.std(ddof=1):.2f}" for one in values)])
+        values = [rows.loc[rows["scene"] == scene, column].to_numpy() for scene in scenes]
+        lines.append([str(method), str(trained_on), *map(words, values)])
     return lines
+
+
+def _accuracy(seeds: Floats) -> str:
+    return f"{percent(seeds.mean(), 2)} ± {100.0 * seeds.std(ddof=1):.2f}"
+
+
+def _r2(seeds: Floats) -> str:
+    return f"{seeds.mean():.2f} ± {seeds.std(ddof=1):.2f}"

@@ -8,6 +8,7 @@ import torch
 from tint_sumo.config import TraitSettings
 from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import write_json
+from tint_sumo.percentages import percent
 from tint_sumo.progress import Report
 from tint_sumo.standings import Title
 from tint_sumo.study.folders import DATASET, trait_folder
@@ -56,4 +57,4 @@ class TraitJob:
         plot_traits(data, self.folder, self.folder)
         add_to_card(self.folder / "model.safetensors", {"accuracy": found["accuracy"]})
         write_json(self.folder / "evaluation.json", found)
-        return f"{found['accuracy']:.1%} of {found['windows']} unseen windows told apart"
+        return f"{percent(found['accuracy'])}% of {found['windows']} unseen windows told apart"

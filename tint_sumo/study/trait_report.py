@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json, whole_file, write_text
+from tint_sumo.percentages import percent
 from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.study.folders import RESULTS
+from tint_sumo.study.methods import look_of_encoder
 from tint_sumo.study.tables import markdown_table
-
-COLOURS = {"vae": "#1b6ca8", "cross_window": "#0b7a3b", "morton": "#c8682c", "classifier": "#555555"}
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ def _accuracy_table(table: pd.DataFrame) -> str:
             [
                 str(row["method"]),
                 f"{row['noise_m']:g}",
-                _mean_sd(row, "svc_percent", ".3f"),
-                _mean_sd(row, "knn_percent", ".3f"),
+                _accuracy(row, "svc_percent"),
+                _accuracy(row, "knn_percent"),
                 _mean_sd(row, "error_m", ".4f"),
                 "-" if pd.isna(row["training_s"]) else f"{row['training_s']:.0f}",
             ]
@@ -128,7 +128,7 @@ def _parts_table(table: pd.DataFrame) -> str:
     measures |= {name.removeprefix("svc_").removesuffix("_percent"): name for name in others}
     lines = [["method", "noise (m)", *measures]]
     for row in table.to_dict("records"):
-        cells = ["-" if pd.isna(row[name]) else f"{row[name]:.2f}" for name in measures.values()]
+        cells = ["-" if pd.isna(row[name]) else percent(row[name] / 100.0, 2) for name in measures.values()]
         lines.append([str(row["method"]), f"{row['noise_m']:g}", *cells])
     return (
         markdown_table(lines)
@@ -153,6 +153,13 @@ def _continuous_table(continuous: pd.DataFrame) -> str:
     )
 
 
+def _accuracy(row: dict[Any, Any], name: str) -> str:
+    if pd.isna(row[name]):
+        return "-"
+    spread = row[f"{name}_sd"]
+    return percent(row[name] / 100.0, 3) + ("" if pd.isna(spread) else f" ± {spread:.3f}")
+
+
 def _mean_sd(row: dict[Any, Any], name: str, form: str) -> str:
     return "-" if pd.isna(row[name]) else _with_spread(row[name], row[f"{name}_sd"], form)
 
@@ -166,16 +173,16 @@ def plot_noise(table: pd.DataFrame, file: Path) -> None:
     figure = Figure(figsize=(6.0, 4.2), dpi=150, layout="constrained")
     axes = figure.subplots()
     for key, rows in table.groupby("method", sort=False):
-        method = str(key)
+        method, look = str(key), look_of_encoder(str(key))
         error = 100.0 - rows["svc_percent"]
         axes.errorbar(
             rows["noise_m"],
             error.clip(lower=0.001),
             yerr=rows["svc_percent_sd"].fillna(0.0),
-            marker="o",
+            marker=look.marker,
             capsize=3,
-            color=COLOURS.get(method),
-            linestyle="--" if method == "classifier" else "-",
+            color=look.colour,
+            linestyle=look.dash,
             label=f"{method} (trained with labels)" if method == "classifier" else method,
         )
     axes.set(

@@ -8,18 +8,20 @@ import numpy as np
 import pandas as pd
 
 from tint_sumo.config import ends
-from tint_sumo.study.methods import METHODS
+from tint_sumo.percentages import percent
+from tint_sumo.study.methods import METHODS, Look, look_of
 from tint_sumo.study.policy_jobs import smoothed_percent
 from tint_sumo.study.rows import WORLDS, Row, by_title, varied
 from tint_sumo.study.tables import Lines
 
-# Of middling lightness, to be seen on white and on black; lines differ in marker and dash, too.
-_COLOURS = (
-    *("#2f7fc1", "#c2571a", "#2a8f5b", "#b0468f", "#8a6fd1", "#8c7324"),
-    *("#c8475a", "#4a8c99", "#7a7f87", "#5f8f1f", "#4f6fe0"),
-)
-_MARKERS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-down", "cross", "hexagon", "pentagon")
-_DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
+# Plotly's names for Matplotlib's markers and line styles.
+_SYMBOLS = {
+    **{"o": "circle", "s": "square", "D": "diamond", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left"},
+    **{">": "triangle-right", "P": "cross", "X": "x", "*": "star", "h": "hexagon"},
+}
+_DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
+# Mixes are no methods: all have one colour, and markers of their own.
+_MIX_COLOUR, _MIX_MARKERS = "#70757a", "oD^sv*PXh"
 _ROW_PX = 46  # height of a method's row
 _CURVE_LINES = 10  # rows of the table of learning curves
 
@@ -40,21 +42,22 @@ def outcome_chart(rows: Sequence[Row], outcome: str) -> Chart:
     for position, mix in enumerate(mixes):
         own = [row for row in rows if ends(row.conditions.p_conservative) == mix]
         shift = 0.0 if len(mixes) == 1 else 0.3 * (2 * position / (len(mixes) - 1) - 1)
-        percent, limits = _rates(own, outcome)
+        shares, limits = _rates(own, outcome)
+        heights = [titles.index(row.title) + shift for row in own]
+        look = Look(_MIX_COLOUR, _MIX_MARKERS[position % len(_MIX_MARKERS)])
         traces.append(
             {
-                **_marks(percent, [titles.index(row.title) + shift for row in own], position, f"P {mix[0]:g}"),
+                **_marks(shares, heights, f"P {mix[0]:g}", look),
                 "mode": "markers",
-                "error_x": _errors(percent, limits),
+                "error_x": _errors(shares, limits),
                 "text": [row.title for row in own],
                 "hovertemplate": "%{text}: %{x:.1f} %<extra>%{fullData.name}</extra>",
             }
         )
     for title, own in by_title(rows).items():
         for row in own:
-            (share,), (limit,) = _rates([row], outcome)
-            span = f"{limit[0]:.1f} to {limit[1]:.1f}"
-            lines.append([title, f"{ends(row.conditions.p_conservative)[0]:g}", f"{share:.1f}", span])
+            share, span = percent(row.rate(outcome)), _span(row.intervals[outcome])
+            lines.append([title, f"{ends(row.conditions.p_conservative)[0]:g}", share, span])
     layout = {
         "height": 120 + _ROW_PX * len(titles),
         "xaxis": {"title": {"text": f"{outcome}, % of the cases"}, "range": [-1, 101]},
@@ -74,18 +77,18 @@ def curve_chart(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Chart:
     traces: list[dict[str, Any]] = []
     lines = [["method", "decisions", "success %", "range of the seeds"]]
     for method, seeds in curves.items():
-        position = _position(method)
-        percent = smoothed_percent(seeds)
-        at, title = percent.index.to_numpy(), METHODS[method].title
-        middle, low, high = percent.mean(axis=1), percent.min(axis=1), percent.max(axis=1)
+        look = look_of(method)
+        success = smoothed_percent(seeds)
+        at, title = success.index.to_numpy(), METHODS[method].title
+        middle, low, high = success.mean(axis=1), success.min(axis=1), success.max(axis=1)
         if len(seeds) > 1:
-            traces.append(_band(at, low.to_numpy(), high.to_numpy(), position))
-        line = _marks(at, _rounded(middle.to_numpy()), position, title)
+            traces.append(_band(at, low.to_numpy(), high.to_numpy(), look))
+        line = _marks(at, _rounded(middle.to_numpy()), title, look)
         line["marker"]["maxdisplayed"] = 8
-        traces.append({**line, "mode": "lines+markers", "line": _line(position)})
+        traces.append({**line, "mode": "lines+markers", "line": _line(look)})
         for row in np.unique(np.linspace(0, len(at) - 1, _CURVE_LINES).round().astype(int)):
-            span = f"{low.iloc[row]:.1f} to {high.iloc[row]:.1f}" if len(seeds) > 1 else "-"
-            lines.append([title, f"{at[row]:,.0f}", f"{middle.iloc[row]:.1f}", span])
+            span = _span((low.iloc[row] / 100.0, high.iloc[row] / 100.0)) if len(seeds) > 1 else "-"
+            lines.append([title, f"{at[row]:,.0f}", percent(middle.iloc[row] / 100.0), span])
     layout = {
         "height": 480,
         "xaxis": {"title": {"text": "decisions of the policy"}},
@@ -100,15 +103,13 @@ def world_charts(rows: Sequence[Row]) -> list[Chart]:
     for name, title in WORLDS.items():
         traces, lines = [], [["method", title, "success %", "95 % interval"]]
         for method, own in by_title(rows).items():
-            position = _position(own[0].method)
+            look = look_of(own[0].method)
             points = varied(own, name)
-            percent, limits = _rates(list(points.values()), "success")
-            for value, share, (low, high) in zip(points, percent, limits, strict=True):
-                lines.append([method, f"{value:g}", f"{share:.1f}", f"{low:.1f} to {high:.1f}"])
-            line = _marks(list(points), percent, position, method, is_open=own[0].is_shipped)
-            traces.append(
-                {**line, "mode": "lines+markers", "line": _line(position), "error_y": _errors(percent, limits)}
-            )
+            shares, limits = _rates(list(points.values()), "success")
+            for value, row in points.items():
+                lines.append([method, f"{value:g}", percent(row.rate("success")), _span(row.intervals["success"])])
+            line = _marks(list(points), shares, method, look, is_open=own[0].is_shipped)
+            traces.append({**line, "mode": "lines+markers", "line": _line(look), "error_y": _errors(shares, limits)})
         if any(len(trace["x"]) > 1 for trace in traces):
             layout = {
                 "height": 480,
@@ -128,38 +129,34 @@ def _rates(rows: Sequence[Row], outcome: str) -> tuple[list[float], list[tuple[f
     )
 
 
-def _errors(percent: Sequence[float], limits: Sequence[tuple[float, float]]) -> dict[str, Any]:
-    above = [round(high - share, 2) for share, (_, high) in zip(percent, limits, strict=True)]
-    below = [round(share - low, 2) for share, (low, _) in zip(percent, limits, strict=True)]
+def _span(interval: tuple[float, float]) -> str:
+    low, high = interval
+    return f"{percent(low)} to {percent(high)}"
+
+
+def _errors(shares: Sequence[float], limits: Sequence[tuple[float, float]]) -> dict[str, Any]:
+    above = [round(high - share, 2) for share, (_, high) in zip(shares, limits, strict=True)]
+    below = [round(share - low, 2) for share, (low, _) in zip(shares, limits, strict=True)]
     return {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1.2, "width": 3}
 
 
-def _position(method: str) -> int:
-    """A method looks the same in every chart."""
-    return list(METHODS).index(method) if method in METHODS else len(METHODS)
-
-
-def _marks(x: Any, y: Any, position: int, name: str, *, is_open: bool = False) -> dict[str, Any]:
-    symbol = _MARKERS[position % len(_MARKERS)] + ("-open" if is_open else "")
-    marker = {"symbol": symbol, "size": 8, "color": _colour(position)}
+def _marks(x: Any, y: Any, name: str, look: Look, *, is_open: bool = False) -> dict[str, Any]:
+    symbol = _SYMBOLS[look.marker] + ("-open" if is_open else "")
+    marker = {"symbol": symbol, "size": 8, "color": look.colour}
     return {"type": "scatter", "x": list(map(float, x)), "y": list(map(float, y)), "name": name, "marker": marker}
 
 
-def _line(position: int) -> dict[str, Any]:
-    return {"color": _colour(position), "dash": _DASHES[position % len(_DASHES)], "width": 1.8}
+def _line(look: Look) -> dict[str, Any]:
+    return {"color": look.colour, "dash": _DASHES[look.dash], "width": 1.8}
 
 
-def _colour(position: int) -> str:
-    return _COLOURS[position % len(_COLOURS)]
-
-
-def _band(at: Any, low: Any, high: Any, position: int) -> dict[str, Any]:
+def _band(at: Any, low: Any, high: Any, look: Look) -> dict[str, Any]:
     return {
         "type": "scatter",
         "x": [*map(float, at), *map(float, at[::-1])],
         "y": [*_rounded(low), *_rounded(high[::-1])],
         "fill": "toself",
-        "fillcolor": _colour(position),
+        "fillcolor": look.colour,
         "opacity": 0.15,
         "line": {"width": 0},
         "mode": "lines",

@@ -105,7 +105,7 @@ class Pane {
       one.number,
       one.trait,
       inferredWords(one.p_conservative) || "nothing",
-      one.attention === null ? "none" : `${Math.round(100 * one.attention)} %`,
+      one.attention === null ? "none" : `${percent(one.attention)} %`,
       one.brakes ? "brakes" : "no",
     ]);
     const head = make("tr");

@@ -64,6 +64,14 @@ class SceneView {
   }
 }
 
+// A share in percent, as percentages.py writes it: only all of something reads 100, and only nothing of it 0.
+const percent = (share) => {
+  const rounded = Math.round(100 * share);
+  if (rounded >= 100 && share < 1) return ">99";
+  if (rounded <= 0 && share > 0) return "<1";
+  return `${rounded}`;
+};
+
 // The colour of the likelier trait, the greyer the less sure.
 const inferredColour = (pConservative) => {
   if (pConservative === null) return "var(--unknown)";
@@ -74,6 +82,6 @@ const inferredColour = (pConservative) => {
 const inferredWords = (pConservative, before = "") => {
   if (pConservative === null) return "";
   const isConservative = pConservative > 0.5;
-  const percent = Math.round(100 * (isConservative ? pConservative : 1 - pConservative));
-  return `${before}${isConservative ? "conservative" : "aggressive"}, ${percent} %`;
+  const probability = isConservative ? pConservative : 1 - pConservative;
+  return `${before}${isConservative ? "conservative" : "aggressive"}, ${percent(probability)} %`;
 };

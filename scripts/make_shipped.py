@@ -1,8 +1,10 @@
 """Remake what data/ ships: trait models, policies, their tables, pictures. Resumes where it was interrupted.
 
     .venv/bin/python scripts/make_shipped.py WORK_FOLDER
+    .venv/bin/python scripts/make_shipped.py --pictures
 
-Takes about three hours on two cores. The commands it runs are those of data/README.md.
+Takes about three hours on two cores. With --pictures it takes a minute, and draws the pictures that follow from the
+shipped policies and from the tables in data/results. The commands it runs are those of data/README.md.
 """
 
 import shutil
@@ -14,23 +16,31 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from tint_sumo import ENV_IDS
 from tint_sumo.cli import main as tint_sumo
+from tint_sumo.envs import SceneEnv
 from tint_sumo.files import write_json
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.scenes import T_INTERSECTION
+from tint_sumo.scenes.geometry import pose_distance_m
+from tint_sumo.simulation.own import OwnSimulation
+from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.study.budgets import BUDGETS
+from tint_sumo.study.figures import plot_bars, plot_worlds
 from tint_sumo.study.methods import Learned, find_method
 from tint_sumo.study.policy_jobs import label
 from tint_sumo.study.results import read_results
-from tint_sumo.study.rows import at_mixes, tabulate
+from tint_sumo.study.results_csv import read_csv
+from tint_sumo.study.rows import at_mixes, over_all_mixes, tabulate
 from tint_sumo.study.training import POLICY
 from tint_sumo.study.trait_models import evaluate_traits
 from tint_sumo.study.trait_study import TraitStudy
 from tint_sumo.traits.storage import add_to_card
 
+TITLE_PX = 26
+CLEAR_M = 0.8
 DATA = Path(__file__).resolve().parents[1] / "data"
 SHIPPED_TRAITS = {"vae": 0.0, "cross_window": 0.05, "morton": 0.0, "classifier": 0.0}  # and the noise in training, m
 
@@ -105,13 +115,20 @@ def copy(source: Path, target: Path) -> None:
     shutil.copyfile(source, target)
 
 
+def make_figures() -> None:
+    """The navigation study's figures, from its shipped table."""
+    rows, _ = read_csv(DATA / "results" / "navigation.csv")
+    plot_bars(at_mixes(rows), DATA / "images" / "navigation.png")
+    plot_worlds(over_all_mixes(rows), DATA / "images" / "worlds.png")
+
+
 def make_pictures() -> None:
-    """The paper's scene, and all scenes side by side."""
+    """The paper's scene, and all scenes side by side, each with its name."""
     pictures = {name: picture_of(name) for name in ENV_IDS}
     Image.fromarray(pictures[T_INTERSECTION]).save(DATA / "images" / "scene.png", optimize=True)
-    small = [Image.fromarray(one).resize((one.shape[1] // 2, one.shape[0] // 2)) for one in pictures.values()]
-    rows = [small[:3], small[3:]]
-    width, heights = small[0].width + 8, [max(one.height for one in row) + 8 for row in rows]
+    titled = [titled_picture(name, picture) for name, picture in pictures.items()]
+    rows = [titled[:3], titled[3:]]
+    width, heights = titled[0].width + 8, [max(one.height for one in row) + 8 for row in rows]
     sheet = Image.new("RGB", (3 * width, sum(heights)), "white")
     for number, row in enumerate(rows):
         for column, one in enumerate(row):
@@ -119,16 +136,49 @@ def make_pictures() -> None:
     sheet.save(DATA / "images" / "scenes.png", optimize=True)
 
 
+def titled_picture(name: str, picture: NDArray[np.uint8]) -> Image.Image:
+    """Half as large, below the name of the scene."""
+    small = Image.fromarray(picture).reduce(2)
+    titled = Image.new("RGB", (small.width, small.height + TITLE_PX), "white")
+    ImageDraw.Draw(titled).text((2, 3), name, fill="black", font=ImageFont.load_default(17))
+    titled.paste(small, (0, TITLE_PX))
+    return titled
+
+
 def picture_of(scene: str) -> NDArray[np.uint8]:
-    """A moment of an episode in which the ego moves in."""
+    """The middle of the moments in which an ego, on its way to success, is in the traffic and clear of all vehicles."""
     env = gymnasium.make(ENV_IDS[scene], render_mode="rgb_array")
-    env.reset(seed=1)
-    for step in range(41):
-        env.step(np.int64(2 if step > 5 else 0))
-    picture = env.render()
-    assert isinstance(picture, np.ndarray)
+    unwrapped = env.unwrapped
+    assert isinstance(unwrapped, SceneEnv)
+    shown: list[NDArray[np.uint8]] = []
+    outcome = ""
+    for seed in range(100):
+        env.reset(seed=seed)
+        shown, outcome = [], ""
+        while not outcome:
+            *_, info = env.step(np.int64(2))
+            outcome = info["outcome"]
+            if is_clear_in_traffic(unwrapped.simulation):
+                picture = env.render()
+                assert isinstance(picture, np.ndarray)
+                shown.append(picture)
+        if outcome == "success" and shown:
+            break
+    else:
+        sys.exit(f"no ego that always goes crosses {scene}")
     env.close()
-    return picture
+    return shown[len(shown) // 2]
+
+
+def is_clear_in_traffic(simulation: Simulation | OwnSimulation) -> bool:
+    """Whether the ego claims a lane and all vehicles are as far from it as its safety check asks, or farther."""
+    assert isinstance(simulation, Simulation)
+    slots, shape = simulation.slots, simulation.scene.vehicle
+    ego, size = simulation.egos.pose[0], (shape.length_m, shape.width_m)
+    poses = slots.pose[0, slots.present[0]]
+    return bool(simulation.egos.has_claimed[0].any()) and all(
+        pose_distance_m(ego, one, *size, *size) >= CLEAR_M for one in poses
+    )
 
 
 def make_films() -> None:
@@ -142,6 +192,11 @@ if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit(__doc__)
     torch.set_num_threads(1)  # the networks are small
+    if sys.argv[1] == "--pictures":
+        make_figures()
+        make_pictures()
+        make_films()
+        sys.exit()
     make_pictures()
     make_traits(Path(sys.argv[1]))
     make_policies(Path(sys.argv[1]))

@@ -9,9 +9,14 @@ from pathlib import Path
 import pytest
 
 from tests.documents import blocks
+from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.percentages import percent
+from tint_sumo.study.results_csv import read_csv
+from tint_sumo.study.rows import at_mixes, by_title, over_all_mixes
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
+RESULTS = ROOT / "data" / "results"
 DOCS = ROOT / "docs"
 TYPED = [
     README,
@@ -87,10 +92,24 @@ def test_the_readme_is_short() -> None:
     ids=("README", "results", "when-traits-help"),
 )
 def test_tables_are_those_of_the_results(page: Path, head: str) -> None:
-    measured = _tables(ROOT / "data" / "results" / "navigation.md")
+    measured = _tables(RESULTS / "navigation.md")
     shown = [table for table in _tables(page) if table.startswith(head)]
     assert len(shown) == 1
     assert shown[0] in measured
+
+
+def test_the_tables_of_the_study_say_what_the_csv_file_says() -> None:
+    rows, ceilings = read_csv(RESULTS / "navigation.csv")
+    text = re.sub(r" +", " ", (RESULTS / "navigation.md").read_text(encoding="utf-8"))
+    for row in at_mixes(rows):
+        rates = [re.escape(percent(row.rate(outcome))) + r" \[[^]]+\]" for outcome in OUTCOMES]
+        line = " \\| ".join([f"{row.conditions.p_conservative:g}", re.escape(row.title), *rates])
+        assert re.search(rf"^\| {line} \|", text, re.MULTILINE), line
+    for title, own in by_title(over_all_mixes(rows)).items():
+        cells = [f"{percent(row.rate('success'))} ({percent(row.rate('collision'))})" for row in own]
+        (line,) = [line for line in text.split("## ")[-1].splitlines() if line.startswith(f"| {title} |")]
+        assert [cell for cell in line.strip("| ").split(" | ")[1:] if cell != "-"] == cells
+    assert f"| ceiling | | {' | '.join(percent(share) for share in ceilings.values())} |" in text
 
 
 def _tables(page: Path) -> list[str]:

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.wrappers import RecordVideo
-from PIL import Image
+from PIL import Image, ImageColor
 
 from tint_sumo import ENV_IDS
 from tint_sumo.config import STEP_S
@@ -20,9 +20,11 @@ from tint_sumo.study.driving import Moment, drive_case
 from tint_sumo.study.evaluation import evaluate
 from tint_sumo.study.film import Film, render_case
 from tint_sumo.study.loading import load_policy
+from tint_sumo.study.methods import METHODS
 from tint_sumo.study.trait_reader import TraitReader, fit_reader
 
 CASE, P = 3, 0.4
+COLOUR = (10, 20, 30)  # of no vehicle
 BLUE, RED, LAMP, CLAIM = (40, 90, 200), (200, 40, 40), (255, 40, 40), (100, 149, 151)
 
 
@@ -33,7 +35,7 @@ def moments(name: str) -> tuple[Moment, ...]:
 
 
 def artist(name: str, reader: TraitReader | None = None) -> Artist:
-    return Artist(layout(find_scene(load_policy(name).scene)), name, reader, has_attention=True)
+    return Artist(layout(find_scene(load_policy(name).scene)), name, COLOUR, reader, has_attention=True)
 
 
 def count(image: Image.Image, colour: tuple[int, ...]) -> int:
@@ -110,6 +112,12 @@ def test_fills_are_inferred_traits_and_outlines_true_ones() -> None:
     assert count(all_blue, RED) == pytest.approx(outlines[1], rel=0.05)
     unsure = artist("ttc", TraitReader(np.array([0.0]), 0.0, has_spread=False)).frame(replace(moment, told=told))
     assert count(unsure, (190, 190, 190)) > 300 * moment.present.sum()
+
+
+def test_a_film_has_the_colour_of_its_method(tmp_path: Path) -> None:
+    render_case(load_policy("ttc"), 0, tmp_path / "strip.png")
+    with Image.open(tmp_path / "strip.png") as strip:
+        assert strip.getpixel((16, 16)) == ImageColor.getrgb(METHODS["ttc"].look.colour)
 
 
 def test_lamps_claims_and_attention_are_seen() -> None:

@@ -9,8 +9,9 @@ from tint_sumo.errors import InputError
 from tint_sumo.files import write_json, write_text
 from tint_sumo.study.budgets import ALL_MIXES, Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE
-from tint_sumo.study.report import StudyReport, result_tables, to_csv, to_markdown, write_report
+from tint_sumo.study.report import StudyReport, result_tables, to_markdown, write_report
 from tint_sumo.study.results import Result
+from tint_sumo.study.results_csv import read_csv, to_csv
 from tint_sumo.study.rows import Row, tabulate
 from tint_sumo.study.statistics import Rate, difference_interval, rate_interval
 from tint_sumo.study.training import CURVE_FILE
@@ -93,13 +94,34 @@ def test_every_file_is_written_and_nothing_else(study: Path, report: StudyReport
 def test_the_csv_file_has_a_line_for_every_row_and_the_documented_columns(report: StudyReport) -> None:
     with report.csv_file.open(newline="") as file:
         lines = list(csv.DictReader(file))
-    world = ["p_conservative", "position_noise_m", "tau_s", "training_percent"]
+    world = ["p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent"]
     closing = ["navigation_time_s", "episodes", "seeds", "ceiling_percent"]
     measured = [f"{outcome}{part}_percent" for outcome in OUTCOMES for part in ("", "_low", "_high", "_sd")]
     paper = [f"paper_{outcome}_percent" for outcome in OUTCOMES]
-    assert list(lines[0]) == ["method", "origin", *world, *measured, *closing, *paper]
+    assert list(lines[0]) == ["method", "origin", "trained_p_conservative", *world, *measured, *closing, *paper]
     assert [line["method"] for line in lines] == [row.method for row in report.rows]
     assert not any(None in line or None in line.values() for line in lines)
+
+
+def test_what_figures_need_can_be_read_back(report: StudyReport) -> None:
+    rows, ceilings = read_csv(report.csv_file)
+    assert ceilings == {0.25: 0.875, 0.4: 1.0}
+    assert to_csv(rows, ceilings) == report.csv_file.read_text()
+    for stored, row in zip(rows, report.rows, strict=True):
+        same = ("method", "origin", "mix", "conditions", "seeds", "episodes", "title", "published")
+        assert [getattr(stored, name) for name in same] == [getattr(row, name) for name in same]
+        for outcome in OUTCOMES:
+            assert stored.rate(outcome) == pytest.approx(row.rate(outcome), abs=5e-5)
+            assert stored.intervals[outcome] == pytest.approx(row.intervals[outcome], abs=5e-5)
+
+
+@pytest.mark.parametrize("text", ["", "method,origin\nttc,given\n", "\0"])
+def test_other_tables_are_refused_in_one_line(text: str, tmp_path: Path) -> None:
+    (tmp_path / "other.csv").write_text(text)
+    with pytest.raises(InputError, match=r"other\.csv is no results\.csv of a study"):
+        read_csv(tmp_path / "other.csv")
+    with pytest.raises(InputError, match=r"nowhere\.csv cannot be read"):
+        read_csv(tmp_path / "nowhere.csv")
 
 
 def test_csv_values_of_several_seeds(report: StudyReport) -> None:

@@ -36,6 +36,7 @@ class Artist:
 
     layout: Layout
     title: str  # what drives where
+    colour: Colour  # of the method, as in all figures
     reader: TraitReader | None  # None where the policy is told no traits
     has_attention: bool
 
@@ -99,7 +100,8 @@ class Artist:
         """What no moment changes: the title, and what the colours mean."""
         image = Image.new("RGB", SIZE_PX, _PAPER)
         draw, top = ImageDraw.Draw(image), SIZE_PX[1] - 46
-        draw.text((10, 6), self.title, font=_font(15), fill=_INK)
+        draw.rectangle((10, 8, 24, 22), fill=self.colour)
+        draw.text((32, 6), self.title, font=_font(15), fill=_INK)
         first, second = self.layout.scene.population.profiles
         left = _key(draw, (10, top), f"true trait: {first.name}", outline=_parts(first.colour))
         left = _key(draw, (left, top), second.name, outline=_parts(second.colour))

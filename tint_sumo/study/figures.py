@@ -16,14 +16,14 @@ from tint_sumo.files import whole_file
 from tint_sumo.percentages import percent
 from tint_sumo.study.methods import METHODS, look_of
 from tint_sumo.study.policy_jobs import smoothed_percent
-from tint_sumo.study.rows import WORLDS, Row, by_title, varied
+from tint_sumo.study.rows import WORLDS, Summary, by_title, varied
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
 INK = {"success": "white", "timeout": "black", "collision": "white"}  # colours of the numbers on these colours
 _PANELS = 3  # panels in a row
 
 
-def plot_bars(rows: Sequence[Row], file: Path) -> Path:
+def plot_bars(rows: Sequence[Summary], file: Path) -> Path:
     """Stacked bars of success, timeout and collision as in the paper's Fig. 4, one panel per P(conservative)."""
     panels = [(p, list(group)) for p, group in groupby(rows, key=lambda row: ends(row.conditions.p_conservative)[0])]
     columns = min(len(panels), _PANELS)
@@ -47,27 +47,27 @@ def plot_bars(rows: Sequence[Row], file: Path) -> Path:
     return _write(figure, file)
 
 
-def _titles(rows: Sequence[Row]) -> list[str]:
+def _titles(rows: Sequence[Summary]) -> list[str]:
     return [row.title for row in rows]
 
 
-def _plot_panel(axes: Axes, rows: Sequence[Row]) -> None:
+def _plot_panel(axes: Axes, rows: Sequence[Summary]) -> None:
     positions = range(len(rows))
     left = [0.0] * len(rows)
     for outcome in OUTCOMES:
         widths = [100.0 * row.rate(outcome) for row in rows]
         axes.barh(positions, widths, 0.72, left=left, color=COLOURS[outcome], label=outcome)
-        for position, start, width in zip(positions, left, widths, strict=True):
+        for row, position, start, width in zip(rows, positions, left, widths, strict=True):
             if width >= 8.0:  # thinner parts have no room for a number
                 text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "color": INK[outcome]}
-                axes.text(start + width / 2, position, percent(width / 100.0), **text)
+                axes.text(start + width / 2, position - 0.1, percent(row.rate(outcome)), **text)
         left = [start + width for start, width in zip(left, widths, strict=True)]
     ends_percent = 100.0 * np.array([row.intervals["success"] for row in rows]).T
     middle = np.array([100.0 * row.rate("success") for row in rows])
     errors = np.abs(ends_percent - middle)
-    axes.errorbar(
-        middle, positions, xerr=errors, fmt="none", ecolor="black", capsize=2, lw=1, label="95 % interval of success"
-    )
+    below = [position + 0.24 for position in positions]  # so that the numbers stay readable
+    interval: dict[str, Any] = {"fmt": "none", "ecolor": "black", "capsize": 2, "lw": 1}
+    axes.errorbar(middle, below, xerr=errors, label="95 % interval of success", **interval)
     published = [row.published.get("success", float("nan")) for row in rows]
     if not np.isnan(published).all():
         axes.plot(published, [position - 0.44 for position in positions], "kv", ms=4, label="success in the paper")
@@ -98,7 +98,7 @@ def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Pat
     return _write(figure, file)
 
 
-def plot_worlds(rows: Sequence[Row], file: Path) -> Path:
+def plot_worlds(rows: Sequence[Summary], file: Path) -> Path:
     """Success in worlds other than the training's, and after parts of the training; a line per method."""
     figure = Figure(figsize=(11.0, 4.2), dpi=150, layout="constrained")
     all_axes = figure.subplots(1, 3, sharey=True)
@@ -113,12 +113,12 @@ def plot_worlds(rows: Sequence[Row], file: Path) -> Path:
     return _write(figure, file)
 
 
-def _plot_line(axes: Axes, rows: Sequence[Row], name: str) -> None:
+def _plot_line(axes: Axes, rows: Sequence[Summary], name: str) -> None:
     if points := varied(rows, name):
         values = list(points)
         success = np.array([100.0 * points[value].rate("success") for value in values])
         limits = np.array([[100.0 * end for end in points[value].intervals["success"]] for value in values]).T
-        style = _line_style(rows[0].method, is_open=rows[0].is_shipped) | {"capsize": 2}
+        style = _line_style(rows[0].method, is_open=rows[0].is_shipped) | {"capsize": 2, "elinewidth": 0.8}
         axes.errorbar(values, success, yerr=np.abs(limits - success), label=rows[0].title, **style)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageColor
 
 from tint_sumo.config import Share, share_words
 from tint_sumo.envs.rendering import RENDER_FPS
@@ -19,6 +19,7 @@ from tint_sumo.study.drawing import SIZE_PX, Artist
 from tint_sumo.study.driving import Moment, drive_case
 from tint_sumo.study.evaluation import CASES_PER_SEED, require_seed
 from tint_sumo.study.loading import Contender
+from tint_sumo.study.methods import look_of
 from tint_sumo.study.trait_reader import fit_reader
 
 SUFFIXES = (".mp4", ".gif", ".png")
@@ -71,7 +72,8 @@ def render_case(
     shown = _spread(moments) if out.suffix == ".png" else moments
     parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(share))
     has_attention = moments[0].attention is not None
-    artist = Artist(layout(played), (" " * 5).join(parts), fit_reader(contender), has_attention)
+    colour = ImageColor.getrgb(look_of(contender.method).colour)
+    artist = Artist(layout(played), (" " * 5).join(parts), colour, fit_reader(contender), has_attention)
     with whole_file(out) as partial:
         _WRITERS[out.suffix](partial, artist, shown, report)
     return Film(moments[-1].outcome, round(moments[-1].time_s, 3), len(shown))

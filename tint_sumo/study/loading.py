@@ -36,6 +36,7 @@ class Contender:
     p_conservative: Share | None = DEFAULT_P_CONSERVATIVE  # what it was trained for; None in a SUMO configuration
     action_repeat: int = 1  # simulation steps per decision
     scene: AnyScene = T_INTERSECTION  # what it was trained in
+    method: str = ""  # name of the method in the registry
 
     @property
     def scene_name(self) -> str:
@@ -75,7 +76,7 @@ def load_policy(name_or_path: str | Path, *, scene: AnyScene | None = None, allo
     method = METHODS.get(str(name_or_path))
     if isinstance(method, Rule):
         place = scene or T_INTERSECTION
-        return _in_scene(Contender(method.name, method.make(place)), place)
+        return _in_scene(Contender(method.name, method.make(place), method=method.name), place)
     if Path(name_or_path).suffix == ".zip":
         stem = Path(name_or_path).with_suffix("")
         found = _contender(stem, _load_zip(Path(name_or_path), allow_pickle))
@@ -144,6 +145,7 @@ def _contender(stem: Path, policy: Any) -> Contender:
         None if card["p_conservative"] is None else ends(card["p_conservative"]),
         int(card["settings"]["action_repeat"]),
         read_described(card),
+        learned.name,
     )
 
 

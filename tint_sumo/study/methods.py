@@ -138,7 +138,7 @@ def look_of_encoder(name: str) -> Look:
     return next((one.look for one in users), Look())
 
 
-register(Rule("always_go", "always go", lambda _: AlwaysGo(), look=Look("#646971", "o", ":")))
+register(Rule("always_go", "always go", lambda _: AlwaysGo(), look=Look("#5444fd", "o", ":")))
 register(Rule("ttc", "time to collision", lambda scene: TimeToCollision(scene=scene), look=Look("#8f9047", "s", ":")))
 register(Learned("no_labels", "no labels", NoTraits, look=Look("#1793fc", "D", "-")))
 register(Learned("morton", "Morton", EncoderTraits, encoder="morton", look=Look("#d77e0b", "^", "--")))
@@ -168,4 +168,4 @@ register(
 register(
     Learned("ma", "Ma", ClassifierTraits, encoder="classifier", trained_as="oracle", look=Look("#15a1bb", "<", "--"))
 )
-register(Learned("oracle", "oracle", OracleTraits, look=Look("#5444fd", ">", "-")))
+register(Learned("oracle", "oracle", OracleTraits, look=Look("#646971", ">", "-")))

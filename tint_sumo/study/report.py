@@ -1,9 +1,7 @@
 """A study's results as CSV, Markdown and figures, from the results of the single jobs."""
 
-import csv
-import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +13,10 @@ from tint_sumo.study.ceiling_job import read_ceilings
 from tint_sumo.study.figures import plot_bars, plot_curves, plot_worlds
 from tint_sumo.study.policy_jobs import read_curves
 from tint_sumo.study.results import read_results
-from tint_sumo.study.rows import Row, at_mixes, by_method, by_title, over_all_mixes, tabulate
+from tint_sumo.study.results_csv import Ceilings, to_csv
+from tint_sumo.study.rows import Row, Summary, at_mixes, by_method, by_title, over_all_mixes, tabulate
 from tint_sumo.study.statistics import difference_interval
 from tint_sumo.study.tables import Lines, Table
-
-Ceilings = Mapping[float, float]  # share of the cases that a careful driver can finish, by P(conservative)
 
 
 @dataclass(frozen=True)
@@ -55,36 +52,6 @@ def write_report(out: Path) -> StudyReport:
     write_text(report.csv_file, to_csv(rows, ceilings))
     write_text(report.markdown_file, markdown)
     return report
-
-
-def to_csv(rows: Sequence[Row], ceilings: Ceilings) -> str:
-    """Rates, ends of intervals and spread in percent; the paper's rates in the last three columns."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    measured = [f"{outcome}{part}_percent" for outcome in OUTCOMES for part in ("", "_low", "_high", "_sd")]
-    world = ["p_conservative", "position_noise_m", "tau_s", "training_percent"]
-    published = [f"paper_{outcome}_percent" for outcome in OUTCOMES]
-    closing = ["navigation_time_s", "episodes", "seeds", "ceiling_percent", *published]
-    writer.writerow(["method", "origin", *world, *measured, *closing])
-    for row in rows:
-        conditions, time_s = row.resolved, row.navigation_time_s
-        ceiling = ceilings.get(_number(row))
-        numbers: list[str] = []
-        for outcome in OUTCOMES:
-            numbers += (_percent(part) for part in (row.rate(outcome), *row.intervals[outcome], row.spread(outcome)))
-        writer.writerow(
-            [
-                *(row.method, row.origin, _mix(row)),
-                *(f"{value:g}" for value in (conditions.position_noise_m, conditions.tau_s, conditions.percent)),
-                *numbers,
-                "" if time_s is None else f"{time_s:.2f}",
-                row.episodes,
-                " ".join(map(str, row.seeds)),
-                _percent(ceiling),
-                *(row.published.get(outcome, "") for outcome in OUTCOMES),
-            ]
-        )
-    return text.getvalue()
 
 
 def to_markdown(tables: Sequence[Table]) -> str:
@@ -127,7 +94,7 @@ _WORLDS_NOTE = (
 )
 
 
-def _success_lines(rows: Sequence[Row], ceilings: Ceilings) -> Lines:
+def _success_lines(rows: Sequence[Summary], ceilings: Ceilings) -> Lines:
     mixes = sorted({_number(row) for row in rows})
     lines = [["method", "seeds", *(f"P {p:g}" for p in mixes)]]
     kinds = dict.fromkeys((row.method, row.origin, row.title, row.mix) for row in by_method(rows))
@@ -143,7 +110,7 @@ def _success_lines(rows: Sequence[Row], ceilings: Ceilings) -> Lines:
     return lines
 
 
-def _outcome_lines(rows: Sequence[Row]) -> Lines:
+def _outcome_lines(rows: Sequence[Summary]) -> Lines:
     lines = [["P", "method", *(f"{outcome} %" for outcome in OUTCOMES), "time s", "cases", "seeds", "paper %"]]
     for row in rows:
         time_s = row.navigation_time_s
@@ -197,7 +164,7 @@ def _difference(row: Row | None, other: Row | None) -> str:
     return f"{100 * (row.rate('success') - other.rate('success')):+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
 
 
-def _world_lines(rows: Sequence[Row]) -> Lines:
+def _world_lines(rows: Sequence[Summary]) -> Lines:
     worlds = list(dict.fromkeys(row.conditions for row in rows))
     lines = [["method", *(one.label for one in worlds)]]
     for title, own in by_title(rows).items():
@@ -210,26 +177,21 @@ def _world_lines(rows: Sequence[Row]) -> Lines:
     return lines
 
 
-def _number(row: Row) -> float:
+def _number(row: Summary) -> float:
     """P(conservative) of a row's cases; NaN where each case has its own."""
     p = row.conditions.p_conservative
     return math.nan if isinstance(p, tuple) else p
 
 
-def _mix(row: Row) -> str:
+def _mix(row: Summary) -> str:
     return share_words(row.conditions.p_conservative)
 
 
-def _percent(share: float | None) -> str:
-    """Write a share for programs that read the table."""
-    return "" if share is None else f"{100.0 * share:.2f}"
-
-
-def _with_spread(row: Row) -> str:
+def _with_spread(row: Summary) -> str:
     spread, rate = row.spread("success"), row.rate("success")
     return percent(rate) + ("" if spread is None else f" ± {100 * spread:.1f}")
 
 
-def _with_interval(row: Row, outcome: str) -> str:
+def _with_interval(row: Summary, outcome: str) -> str:
     low, high = row.intervals[outcome]
     return f"{percent(row.rate(outcome))} [{percent(low)}, {percent(high)}]"

@@ -1,10 +1,11 @@
 """The rows of the results: all seeds of a method under the same conditions."""
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,21 +26,43 @@ WORLDS = {  # what can differ from the world of the training
 
 
 @dataclass(frozen=True)
-class Row:
-    """Policies of one method that differ by their training's seed alone, tested on the same cases."""
+class Summary(ABC):
+    """What tables, figures and files show of policies that differ by their training's seed alone."""
 
     method: str
     origin: str
     mix: Share | None  # P(conservative) in training
     conditions: Conditions
     seeds: tuple[int, ...]
-    evaluations: tuple[Evaluation, ...]  # one for each seed
     scene_tau_s: float  # headway of the scene's drivers
 
     @property
     def resolved(self) -> Conditions:
         """The conditions with the scene's headway where none was given."""
         return self.conditions.resolved(self.scene_tau_s)
+
+    @property
+    @abstractmethod
+    def episodes(self) -> int:
+        """Number of cases."""
+
+    @abstractmethod
+    def rate(self, outcome: str) -> float:
+        """Share of the cases with an outcome, over all seeds."""
+
+    @abstractmethod
+    def spread(self, outcome: str) -> float | None:
+        """Standard deviation between the seeds; None with one seed."""
+
+    @property
+    @abstractmethod
+    def intervals(self) -> Mapping[str, Interval]:
+        """95 % intervals of the outcomes: over seeds and cases, or over cases alone where there is one seed."""
+
+    @property
+    @abstractmethod
+    def navigation_time_s(self) -> float | None:
+        """Mean time of successful episodes; None without any."""
 
     @property
     def is_shipped(self) -> bool:
@@ -53,8 +76,22 @@ class Row:
         return f"{title} (shipped)" if self.is_shipped else title
 
     @property
+    def published(self) -> dict[str, float]:
+        """The paper's rates in percent, empty where it has none; for its own conditions alone."""
+        if not self.conditions.is_single_mix:
+            return {}
+        low, _ = ends(self.conditions.p_conservative)
+        return dict(zip(OUTCOMES, RATES_PERCENT.get((self.method, low), ()), strict=False))
+
+
+@dataclass(frozen=True)
+class Row(Summary):
+    """The results of such policies in the same cases, case by case."""
+
+    evaluations: tuple[Evaluation, ...]  # one for each seed
+
+    @property
     def episodes(self) -> int:
-        """Number of cases."""
         return len(self.evaluations[0].cases)
 
     def hits(self, outcome: str) -> Hits:
@@ -65,20 +102,17 @@ class Row:
         return float(self.hits(outcome).mean())
 
     def spread(self, outcome: str) -> float | None:
-        """Standard deviation between the seeds; None with one seed."""
         rates = self.hits(outcome).mean(axis=1)
         return float(rates.std(ddof=1)) if len(rates) > 1 else None
 
     @cached_property
     def intervals(self) -> dict[str, Interval]:
-        """95 % intervals of the outcomes: over seeds and cases, or over cases alone where there is one seed."""
         if len(self.seeds) == 1:
             return {outcome: self.evaluations[0].rate(outcome).interval for outcome in OUTCOMES}
         return {outcome: rate_interval(self.hits(outcome)) for outcome in OUTCOMES}
 
     @property
     def navigation_time_s(self) -> float | None:
-        """Mean time of successful episodes; None without any."""
         return self._pooled.navigation_time_s
 
     @property
@@ -89,14 +123,6 @@ class Row:
     @property
     def _pooled(self) -> Evaluation:
         return Evaluation(tuple(case for one in self.evaluations for case in one.cases))
-
-    @property
-    def published(self) -> dict[str, float]:
-        """The paper's rates in percent, empty where it has none; for its own conditions alone."""
-        if not self.conditions.is_single_mix:
-            return {}
-        low, _ = ends(self.conditions.p_conservative)
-        return dict(zip(OUTCOMES, RATES_PERCENT.get((self.method, low), ()), strict=False))
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -115,6 +141,9 @@ class Row:
             "collisions": self.collisions,
             "published_percent": self.published or None,
         }
+
+
+AnyRow = TypeVar("AnyRow", bound=Summary)
 
 
 def tabulate(results: Sequence[Result]) -> list[Row]:
@@ -145,36 +174,36 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
         seeds = tuple(result.seed for result, _ in members)
         evaluations = tuple(one.evaluation for _, one in members)
         rows.append(
-            Row(first.method, first.origin, first.mix, tested.conditions, seeds, evaluations, first.scene_tau_s)
+            Row(first.method, first.origin, first.mix, tested.conditions, seeds, first.scene_tau_s, evaluations)
         )
     return rows
 
 
-def at_mixes(rows: Sequence[Row]) -> list[Row]:
+def at_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
     """The rows of the main table: fully trained, the default world, one P(conservative) each."""
     return [row for row in rows if row.conditions.is_single_mix]
 
 
-def over_all_mixes(rows: Sequence[Row]) -> list[Row]:
+def over_all_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
     """The rows of other worlds and parts of the training, where every case has a mix of its own."""
     return [row for row in rows if isinstance(row.conditions.p_conservative, tuple)]
 
 
-def by_method(rows: Sequence[Row]) -> list[Row]:
+def by_method(rows: Sequence[AnyRow]) -> list[AnyRow]:
     """The rows in the registry's order, whatever the conditions; shipped policies come first."""
     order = {name: position for position, name in enumerate(METHODS)}
     return sorted(rows, key=lambda row: (order.get(row.method, len(order)), row.origin != GIVEN))
 
 
-def by_title(rows: Sequence[Row]) -> dict[str, list[Row]]:
+def by_title(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
     """The rows of each method, shipped policies apart, in the registry's order."""
-    found: dict[str, list[Row]] = {}
+    found: dict[str, list[AnyRow]] = {}
     for row in by_method(rows):
         found.setdefault(row.title, []).append(row)
     return found
 
 
-def varied(rows: Sequence[Row], name: str) -> dict[float, Row]:
+def varied(rows: Sequence[AnyRow], name: str) -> dict[float, AnyRow]:
     """The rows that differ from the world of the training in at most one condition, by its values in their order."""
     base = Conditions(rows[0].conditions.p_conservative)
     shown = [row for row in rows if replace(row.conditions, **{name: getattr(base, name)}) == base]

@@ -11,7 +11,7 @@ from tint_sumo.config import ends
 from tint_sumo.percentages import percent
 from tint_sumo.study.methods import METHODS, Look, look_of
 from tint_sumo.study.policy_jobs import smoothed_percent
-from tint_sumo.study.rows import WORLDS, Row, by_title, varied
+from tint_sumo.study.rows import WORLDS, Summary, by_title, varied
 from tint_sumo.study.tables import Lines
 
 # Plotly's names for Matplotlib's markers and line styles.
@@ -34,7 +34,7 @@ class Chart:
     figure: dict[str, Any]  # Plotly's data and layout
 
 
-def outcome_chart(rows: Sequence[Row], outcome: str) -> Chart:
+def outcome_chart(rows: Sequence[Summary], outcome: str) -> Chart:
     """Rates of an outcome with intervals: a line of the chart for each method, a marker for each mix."""
     titles = list(by_title(rows))
     mixes = sorted({ends(row.conditions.p_conservative) for row in rows})
@@ -97,7 +97,7 @@ def curve_chart(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Chart:
     return Chart("curves", "Success in training by decisions", lines, {"data": traces, "layout": layout})
 
 
-def world_charts(rows: Sequence[Row]) -> list[Chart]:
+def world_charts(rows: Sequence[Summary]) -> list[Chart]:
     """Success against each condition in which the rows differ from the training's world."""
     charts = []
     for name, title in WORLDS.items():
@@ -120,7 +120,7 @@ def world_charts(rows: Sequence[Row]) -> list[Chart]:
     return charts
 
 
-def _rates(rows: Sequence[Row], outcome: str) -> tuple[list[float], list[tuple[float, float]]]:
+def _rates(rows: Sequence[Summary], outcome: str) -> tuple[list[float], list[tuple[float, float]]]:
     """Of each row, in percent: the rate, and the ends of its interval."""
     limits = [row.intervals[outcome] for row in rows]
     return (

@@ -1,0 +1,141 @@
+"""A study's results as CSV: a line for each row of its tables, for other programs and for figures."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tint_sumo.config import Share, share_words
+from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.errors import InputError
+from tint_sumo.study.budgets import Conditions
+from tint_sumo.study.rows import Summary
+from tint_sumo.study.statistics import Interval
+
+Ceilings = Mapping[float, float]  # share of the cases that a careful driver can finish, by P(conservative)
+
+_PARTS = ("", "_low", "_high", "_sd")  # a rate, the ends of its interval, its spread between seeds
+_WORLD = ("p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent")
+COLUMNS = (
+    *("method", "origin", "trained_p_conservative", *_WORLD),
+    *(f"{outcome}{part}_percent" for outcome in OUTCOMES for part in _PARTS),
+    *("navigation_time_s", "episodes", "seeds", "ceiling_percent"),
+    *(f"paper_{outcome}_percent" for outcome in OUTCOMES),
+)
+
+
+@dataclass(frozen=True)
+class StoredRow(Summary):
+    """A line of such a table that was read back: rates and intervals, without the single cases."""
+
+    cases: int
+    rates: Mapping[str, float]  # by outcome, as are the next two
+    limits: Mapping[str, Interval]
+    spreads: Mapping[str, float | None]
+    time_s: float | None
+
+    @property
+    def episodes(self) -> int:
+        return self.cases
+
+    def rate(self, outcome: str) -> float:
+        return self.rates[outcome]
+
+    def spread(self, outcome: str) -> float | None:
+        return self.spreads[outcome]
+
+    @property
+    def intervals(self) -> Mapping[str, Interval]:
+        return self.limits
+
+    @property
+    def navigation_time_s(self) -> float | None:
+        return self.time_s
+
+
+def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
+    """Return rates, ends of intervals and spread in percent; the paper's rates are in the last three columns."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for row in rows:
+        conditions, time_s = row.resolved, row.navigation_time_s
+        world = (conditions.position_noise_m, conditions.tau_s, row.scene_tau_s, conditions.percent)
+        p = conditions.p_conservative
+        ceiling = None if isinstance(p, tuple) else ceilings.get(p)
+        numbers: list[str] = []
+        for outcome in OUTCOMES:
+            numbers += (_percent(part) for part in (row.rate(outcome), *row.intervals[outcome], row.spread(outcome)))
+        writer.writerow(
+            [
+                *(row.method, row.origin, "" if row.mix is None else share_words(row.mix), share_words(p)),
+                *(f"{value:g}" for value in world),
+                *numbers,
+                "" if time_s is None else f"{time_s:.2f}",
+                row.episodes,
+                " ".join(map(str, row.seeds)),
+                _percent(ceiling),
+                *(row.published.get(outcome, "") for outcome in OUTCOMES),
+            ]
+        )
+    return text.getvalue()
+
+
+def read_csv(file: Path) -> tuple[list[StoredRow], dict[float, float]]:
+    """Return the rows of a table that ``to_csv`` wrote, and the ceilings, by P(conservative).
+
+    Raises:
+        InputError: there is no such file, or it is another kind of table.
+    """
+    try:
+        with file.open(newline="", encoding="utf-8") as lines:
+            table = list(csv.DictReader(lines, strict=True))
+        if not table:
+            raise ValueError("no rows")
+        rows = [_row(line) for line in table]
+        stated = [line for line in table if line["ceiling_percent"]]
+        ceilings = {float(line["p_conservative"]): _read_percent(line["ceiling_percent"]) for line in stated}
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror}") from None
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        raise InputError(f"{file} is no results.csv of a study ({error!r})") from None
+    return rows, ceilings
+
+
+def _row(line: Mapping[str, str]) -> StoredRow:
+    rates, limits, spreads = {}, {}, {}
+    for outcome in OUTCOMES:
+        rate, low, high, spread = (line[f"{outcome}{part}_percent"] for part in _PARTS)
+        rates[outcome], limits[outcome] = _read_percent(rate), (_read_percent(low), _read_percent(high))
+        spreads[outcome] = _read_percent(spread) if spread else None
+    mix, time_s = line["trained_p_conservative"], line["navigation_time_s"]
+    p, noise_m, tau_s, scene_tau_s, percent = (line[name] for name in _WORLD)
+    return StoredRow(
+        line["method"],
+        line["origin"],
+        _mix(mix) if mix else None,
+        Conditions(_mix(p), float(noise_m), float(tau_s), int(percent)).relative_to(float(scene_tau_s)),
+        tuple(map(int, line["seeds"].split())),
+        float(scene_tau_s),
+        int(line["episodes"]),
+        rates,
+        limits,
+        spreads,
+        float(time_s) if time_s else None,
+    )
+
+
+def _mix(words: str) -> Share:
+    """Return what ``share_words`` wrote."""
+    low, *high = map(float, words.split(" to "))
+    return (low, high[0]) if high else low
+
+
+def _percent(share: float | None) -> str:
+    """Return a share with more digits than people read."""
+    return "" if share is None else f"{100.0 * share:.2f}"
+
+
+def _read_percent(words: str) -> float:
+    return float(f"{words}e-2")  # the share that was meant, where a division by 100 gives a neighbour of it

@@ -132,5 +132,5 @@ def test_rows_are_ready_for_json() -> None:
 def test_collisions_are_counted_over_all_seeds() -> None:
     lower, upper = Case("collision", 4.0, "aggressive", "lower"), Case("collision", 4.0, "conservative", "upper")
     evaluations = (Evaluation((lower, lower)), Evaluation((lower, upper)))
-    row = Row("oracle", TRAINED, ALL_MIXES, WORLD, (0, 1), evaluations, scene_tau_s=1.0)
+    row = Row("oracle", TRAINED, ALL_MIXES, WORLD, (0, 1), 1.0, evaluations)
     assert row.collisions == {"aggressive, lower": 3, "conservative, upper": 1}

@@ -4,10 +4,12 @@ import atexit
 import gc
 import os
 import signal
+import sys
 import threading
 import traceback
-from collections.abc import Callable
-from multiprocessing import connection, get_context, parent_process
+from collections.abc import Callable, Mapping
+from multiprocessing import connection, forkserver, get_context, parent_process, resource_tracker
+from multiprocessing.context import ForkServerContext
 from types import FrameType
 from typing import Any, Literal, NoReturn
 
@@ -15,7 +17,10 @@ from tint_sumo.errors import InputError
 
 Told = tuple[Literal["done", "refused", "failed"], Any]
 
-SPAWN = get_context("spawn")  # a forked child would share a running libsumo
+# A child forked from this process would share a running libsumo. One forked from the server, which runs no simulation,
+# starts in milliseconds with all modules loaded, where a new interpreter loads them for seconds.
+_CONTEXT = get_context("forkserver")
+_FOR_MAIN = {signal.SIGINT, signal.SIGTERM}  # signals to a whole process group; the main process ends the others
 
 
 def start_worker(
@@ -25,21 +30,44 @@ def start_worker(
 
     It never sees Ctrl-C: the main process tells it to end. A daemon cannot start workers itself.
     """
-    pipe, theirs = SPAWN.Pipe()
-    process = SPAWN.Process(target=_work, args=(target, theirs, *arguments), daemon=daemon)
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        process.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    context = worker_context()
+    pipe, theirs = context.Pipe()
+    process = context.Process(target=_work, args=(target, theirs, dict(os.environ), *arguments), daemon=daemon)
+    process.start()
     theirs.close()
     return pipe, process
 
 
-def _work(target: Callable[..., None], pipe: connection.Connection, *arguments: Any) -> None:
+def worker_context() -> ForkServerContext:
+    """Return the multiprocessing context of all workers, with its server running.
+
+    The server loads the modules of this package that this process has loaded when the first worker starts; a worker
+    imports what comes later by itself. The server and the workers never see Ctrl-C, nor SIGTERM before ``begin_work``.
+    """
+    _CONTEXT.set_forkserver_preload([name for name in sys.modules if name.startswith("tint_sumo.")])
+    resource_tracker.ensure_running()  # else the server starts it, which would unblock the signals again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_MAIN)
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return _CONTEXT
+
+
+def _work(
+    target: Callable[..., None], pipe: connection.Connection, environment: dict[str, str], *arguments: Any
+) -> None:
+    begin_work(environment)
+    target(pipe, *arguments)
+
+
+def begin_work(environment: Mapping[str, str]) -> None:
+    """Call first in a worker, with the main process's environment variables: those of the server may be older."""
+    os.environ.clear()
+    os.environ.update(environment)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     end_with_parent()
     end_quickly()
-    target(pipe, *arguments)
 
 
 def end_quickly() -> None:
@@ -57,6 +85,8 @@ def interrupt_on_sigterm() -> None:
 
 
 def _raise_interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
+    # A signal to the whole process group comes a second time from the main process, while work is being saved.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 
@@ -87,7 +117,7 @@ def answer(message: Told, worker: str) -> Any:
 
 
 def end_with_parent() -> None:
-    """Call in a worker: end it as soon as its parent is gone.
+    """End this worker as soon as its parent is gone.
 
     A killed main process cannot tell anyone, and two runs must never write the same files.
     """

@@ -9,9 +9,11 @@ from pathlib import Path
 from tint_sumo.errors import InputError
 from tint_sumo.executors import Local
 from tint_sumo.files import write_text
+from tint_sumo.processes import interrupt_on_sigterm
 from tint_sumo.progress import Progress, Report
 from tint_sumo.standings import Title
 
+SAVING_S = 0.2  # longer than a signal takes that comes a second time
 GATE_S = 120.0  # a test that has failed opens no gate
 
 
@@ -56,6 +58,7 @@ class FileJob:
         try:
             return self._run(report)
         except KeyboardInterrupt:
+            time.sleep(SAVING_S)
             write_text(self.path("interrupted"), "")
             raise
 
@@ -130,6 +133,7 @@ class CountJob:
 
 
 if __name__ == "__main__":
+    interrupt_on_sigterm()
     folder, is_short = Path(sys.argv[1]), "short" in sys.argv
     times = {"reports": 3} if is_short else {"patience_s": 60.0}
     try:

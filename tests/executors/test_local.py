@@ -36,7 +36,8 @@ def is_alive(pid: int) -> bool:
 @pytest.fixture
 def pool(tmp_path: Path) -> Iterator["subprocess.Popen[bytes]"]:
     """A program with two jobs in progress that take long."""
-    process = subprocess.Popen([sys.executable, "-m", "tests.executors.jobs", str(tmp_path)])
+    command = [sys.executable, "-m", "tests.executors.jobs", str(tmp_path)]
+    process = subprocess.Popen(command, process_group=0)
     pids = [tmp_path / f"{name}.pid" for name in ("first", "second")]
     wait_until(lambda: all(path.exists() for path in pids))
     yield process
@@ -127,8 +128,15 @@ def test_what_a_job_prints_is_in_its_log(tmp_path: Path) -> None:
         read_log(tmp_path / "other", "good")
 
 
-def test_an_interruption_reaches_the_jobs(pool: "subprocess.Popen[bytes]", tmp_path: Path) -> None:
-    pool.send_signal(signal.SIGINT)
+@pytest.mark.parametrize(
+    ("send", "ending"),
+    [(os.kill, signal.SIGINT), (os.killpg, signal.SIGINT), (os.killpg, signal.SIGTERM)],
+    ids=["main process", "Ctrl-C", "timeout"],
+)
+def test_an_interruption_reaches_the_jobs(
+    pool: "subprocess.Popen[bytes]", tmp_path: Path, send: Callable[[int, int], None], ending: signal.Signals
+) -> None:
+    send(pool.pid, ending)
     assert pool.wait(PATIENCE_S) == 130
     names = {path.name for path in tmp_path.iterdir()}
     states = ("pid", "tries", "interrupted")

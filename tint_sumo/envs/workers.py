@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from multiprocessing.connection import Connection
+from multiprocessing.sharedctypes import RawArray
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from tint_sumo.envs.batch import Ended, LocalBatch, Snapshot
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import Rows, row_type
-from tint_sumo.processes import SPAWN, answer, start_worker, told
+from tint_sumo.processes import answer, start_worker, told
 from tint_sumo.simulation.connection import libsumo_is_free
 
 _ENDING_S = 10.0  # more than enough for a step, and to close a simulation
@@ -152,7 +153,7 @@ class _Shared:
         self._workers = workers
         self._row = row_type(max_vehicles)
         self._rows_at = 2 * workers * _INTEGER.itemsize
-        self._memory = SPAWN.RawArray("B", self._rows_at + num_envs * self._row.itemsize)
+        self._memory = RawArray("B", self._rows_at + num_envs * self._row.itemsize)
 
     @property
     def sent(self) -> NDArray[np.int64]:

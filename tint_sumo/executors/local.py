@@ -1,6 +1,6 @@
 """Work in processes of this machine."""
 
-import signal
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -11,7 +11,7 @@ from typing import TypeVar
 from tint_sumo.errors import InputError
 from tint_sumo.executors.jobs import Begun, Ended, Job, News, Work, run_jobs
 from tint_sumo.executors.process import JobProcess
-from tint_sumo.processes import SPAWN, end_with_parent
+from tint_sumo.processes import begin_work, worker_context
 
 T = TypeVar("T")
 
@@ -38,7 +38,8 @@ class Local:
         if self.workers == 1:
             yield map(work, numbers)
             return
-        with ProcessPoolExecutor(self.workers, SPAWN, initializer=_start_worker) as pool:
+        context, environment = worker_context(), (dict(os.environ),)
+        with ProcessPoolExecutor(self.workers, context, initializer=begin_work, initargs=environment) as pool:
             try:
                 yield _ahead(pool, work, numbers, self.workers)
             finally:
@@ -82,9 +83,3 @@ def _ahead(pool: ProcessPoolExecutor, work: Work[T], numbers: Iterable[int], wor
             yield pending.pop(0).result()
     for future in pending:
         yield future.result()
-
-
-def _start_worker() -> None:
-    """Leave Ctrl-C to the main process, and go with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()

@@ -1,6 +1,7 @@
 """Shared by all tests."""
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -12,6 +13,11 @@ from tests.scenes.own_networks import OWN_NETWORKS, OwnNetwork
 
 settings.register_profile("tint_sumo", deadline=None)  # no test fails because the machine is busy
 settings.load_profile("tint_sumo")
+
+
+# What a shell of a script starts in the background ignores Ctrl-C, and so would all that tests start.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True, scope="session")

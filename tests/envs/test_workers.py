@@ -195,6 +195,7 @@ from tint_sumo.envs.vector import SceneVectorEnv
 if __name__ == "__main__":
     vector = SceneVectorEnv(4, workers=3)
     vector.reset(seed=0)
+    vector.step(np.zeros(4, np.int64))
     print(*(process.pid for process in multiprocessing.active_children()), flush=True)
     while True:
         vector.step(np.zeros(4, np.int64))
@@ -203,7 +204,6 @@ if __name__ == "__main__":
     assert main.stdout is not None and main.stderr is not None
     ids = [int(word) for word in main.stdout.readline().split()]
     assert len(ids) == 2
-    time.sleep(0.2)
     main.send_signal(ending)
     assert main.wait(PATIENCE_S) != 0
     wait_until_ended(ids)

@@ -37,6 +37,12 @@ def test_a_case_is_the_first_episode_of_its_seed() -> None:
     assert case.time_s == pytest.approx(steps * STEP_S)
 
 
+def test_cases_can_begin_anywhere_in_a_set() -> None:
+    whole = evaluate(AlwaysGo(), make_venv, 7, 0).cases
+    assert evaluate(AlwaysGo(), make_venv, 4, 0, first=3, batch=3).cases == whole[3:]
+    assert whole[3:] != whole[:4]
+
+
 def test_seeds_are_different_cases() -> None:
     one, other = (evaluate(AlwaysGo(), make_venv, 12, seed) for seed in (0, 1))
     assert one != other

@@ -28,7 +28,7 @@ Rows = NDArray[np.void]  # records (N,) of a row type
 def row_type(max_vehicles: int) -> np.dtype[np.void]:
     """What one environment tells of itself and of so many vehicle slots."""
     slots = (max_vehicles,)
-    return np.dtype(
+    layout = np.dtype(
         [
             ("ego", np.float32, (4,)),
             ("vehicles", np.float32, (max_vehicles, 2)),
@@ -46,6 +46,7 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
         ],
         align=True,
     )
+    return np.dtype((np.record, layout))  # fields are attributes where functions are not compiled, too
 
 
 _OUTCOME_NAMES = np.array(["", *OUTCOMES], object)  # by their numbers in rows

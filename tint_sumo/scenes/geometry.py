@@ -20,7 +20,7 @@ Numbers = NDArray[np.int64]
 SPACING_M = 0.02  # a chord of a circle of 6 m lies within 0.01 mm of it
 
 # A box's centre and unit heading.
-POSE = np.dtype([(part, np.float64) for part in ("x_m", "y_m", "heading_x", "heading_y")])
+POSE = np.dtype((np.record, [(part, np.float64) for part in ("x_m", "y_m", "heading_x", "heading_y")]))
 Poses = NDArray[np.void]  # records of POSE
 
 

@@ -1,0 +1,119 @@
+"""What is written of a step made by hand."""
+
+import math
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tint_sumo.envs.rows import OUTCOMES, Scales, TaskRules, judge, observe, observe_tracks, outcome_name, row_type
+from tint_sumo.scenes.geometry import POSE
+
+RULES = TaskRules(goal_m=30.0, step_limit=100, goal=2.5, collision=-2.0, speed_weight_per_mps=0.05, step=-0.25)
+GOAL, BEYOND = 30.0, math.nextafter(30.0, math.inf)
+
+
+def judged(front_m: float, collided: bool, steps: int, speed_mps: float = 2.0) -> tuple[np.ndarray, bool]:
+    rows = np.zeros(1, row_type(2))
+    rows["outcome"] = 3  # of an earlier episode
+    ended = judge(np.array([front_m]), np.array([speed_mps]), np.array([collided]), np.array([steps]), RULES, rows)
+    return rows[0], ended
+
+
+@pytest.mark.parametrize(
+    ("front_m", "collided", "steps", "outcome"),
+    [
+        (GOAL, False, 99, ""),
+        (BEYOND, False, 99, "success"),
+        (BEYOND, False, 100, "success"),
+        (GOAL, False, 100, "timeout"),
+        (GOAL, False, 101, "timeout"),
+        (GOAL, True, 99, "collision"),
+        (GOAL, True, 100, "collision"),
+        (BEYOND, True, 99, "collision"),  # in the very step in which it arrives
+        (BEYOND, True, 100, "collision"),
+    ],
+)
+def test_a_step_ends_in_a_collision_before_a_success_before_a_timeout(
+    front_m: float, collided: bool, steps: int, outcome: str
+) -> None:
+    row, ended = judged(front_m, collided, steps)
+    assert outcome_name(row["outcome"]) == outcome
+    assert ended == bool(outcome)
+    assert row["terminated"] == (outcome in ("success", "collision"))
+    assert row["truncated"] == (outcome == "timeout")
+
+
+@pytest.mark.parametrize(
+    ("front_m", "collided", "steps", "terms"),
+    [
+        (0.0, False, 1, (0.0, 0.0, 0.1, -0.25)),
+        (0.0, False, 100, (0.0, 0.0, 0.1, -0.25)),  # of a timeout as of any other step
+        (BEYOND, False, 1, (2.5, 0.0, 0.0, 0.0)),
+        (BEYOND, True, 1, (0.0, -2.0, 0.0, 0.0)),
+    ],
+)
+def test_the_reward_is_the_sum_of_its_terms(front_m: float, collided: bool, steps: int, terms: Any) -> None:
+    row, _ = judged(front_m, collided, steps)
+    assert tuple(row[name] for name in ("goal", "collision", "speed", "step")) == pytest.approx(terms)
+    assert row["reward"] == pytest.approx(sum(terms))
+
+
+def test_each_row_is_judged_by_its_own_numbers() -> None:
+    cases = list(product((0.0, BEYOND), (False, True), (1, 100)))
+    rows = np.zeros(len(cases), row_type(1))
+    front_m, collided, steps = (np.array(part) for part in zip(*cases, strict=True))
+    assert judge(front_m, np.arange(len(cases), dtype=float), collided, steps, RULES, rows)
+    for row, case, speed_mps in zip(rows, cases, range(len(cases)), strict=True):
+        told = judged(*case, speed_mps)[0]
+        assert all(row[name] == told[name] for name in ("outcome", "reward", "terminated", "truncated"))
+    assert {outcome_name(row["outcome"]) for row in rows} == {"", *OUTCOMES}
+
+
+def test_an_end_is_told_wherever_it_is() -> None:
+    for ended in ([False, False], [True, False], [False, True]):
+        rows = np.zeros(2, row_type(1))
+        still = np.zeros(2)
+        assert judge(still, still, np.array(ended), np.zeros(2, np.int64), RULES, rows) == any(ended)
+
+
+def poses(*values: tuple[float, float, float, float]) -> np.ndarray:
+    return np.array(list(values), POSE)
+
+
+def test_observations_are_scaled_and_bounded() -> None:
+    rows = np.zeros(2, row_type(3))
+    rows["vehicles"] = rows["mask"] = 9.0  # of an earlier step
+    egos = poses((2.0, -4.0, 0.6, 0.8), (100.0, -100.0, 0.0, -1.0))
+    near, far, gone = (12.0, -14.0, 1.0, 0.0), (500.0, -500.0, 1.0, 0.0), (7.0, 7.0, 1.0, 0.0)
+    vehicles = np.stack([poses(near, far, gone), poses(gone, gone, near)])
+    present = np.array([[True, True, False], [False, False, True]])
+    traits = np.array([[1, 0, -1], [-1, -1, 1]], np.int8)
+    noise_m = np.zeros((2, 3, 2))
+    noise_m[0, 0], noise_m[0, 2] = (1.0, -2.0), (5.0, 5.0)
+    steps = np.array([7, 30])
+    observe(egos, np.array([1.5, 30.0]), present, vehicles, traits, noise_m, steps, Scales(20.0, 3.0, 0.1), rows)
+    np.testing.assert_allclose(rows["ego"], [[0.1, -0.2, 0.3, 0.4], [2.0, -2.0, 0.0, -2.0]], atol=1e-7)
+    np.testing.assert_allclose(rows["vehicles"][0], [[0.55, -0.6], [2.0, -2.0], [0.0, 0.0]], atol=1e-7)
+    np.testing.assert_allclose(rows["vehicles"][1], [[0.0, 0.0], [0.0, 0.0], [-2.0, 2.0]], atol=1e-7)
+    np.testing.assert_array_equal(rows["mask"], present.astype(float))
+    np.testing.assert_array_equal(rows["traits"], traits)
+    np.testing.assert_allclose(rows["time_s"], [0.7, 3.0])
+
+
+def test_tracks_are_seen_with_the_noise_along_the_way() -> None:
+    rows = np.zeros(1, row_type(4))
+    rows["position_m"] = rows["gap_m"] = 9.0
+    west, north = (0.0, 0.0, -1.0, 0.0), (0.0, 0.0, 0.6, 0.8)
+    vehicles = poses(west, north, west, north)[None]
+    present = np.array([[True, True, True, False]])
+    noise_m = np.array([[[0.5, 9.0], [1.0, 2.0], [-0.25, 0.0], [4.0, 4.0]]])
+    front_m, gap_m = np.array([[10.0, 20.0, 30.0, 40.0]]), np.array([[3.0, 4.0, 0.0, 0.0]])
+    leader = np.array([[1, 0, -1, -1]])
+    route, passed_m = np.array([[0, 1, 1, 0]]), np.array([5.0, 6.0])
+    observe_tracks(np.array([6.0]), passed_m, present, route, vehicles, front_m, leader, gap_m, noise_m, rows)
+    # Along their ways the noise is -0.5, 2.2, 0.25 and 5.6 m.
+    np.testing.assert_allclose(rows["position_m"], [[9.5, 22.2, 30.25, 0.0]])
+    np.testing.assert_allclose(rows["gap_m"], [[3.0 + 0.5 + 2.2, 4.0 - 2.2 - 0.5, np.inf, np.inf]])
+    np.testing.assert_array_equal(rows["passed"], [[1, 0, 0, 0]])

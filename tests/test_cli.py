@@ -16,6 +16,7 @@ import torch
 
 from tests.terminal import look, open_terminal
 from tint_sumo import traits
+from tint_sumo.checkpoints import CHECKPOINT_FILE
 from tint_sumo.cli import main
 from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.recorder import record
@@ -451,11 +452,11 @@ def test_an_interrupted_training_goes_on(tmp_path: Path, capsys: pytest.CaptureF
     assert "Traceback" not in printed
     assert "tint-sumo: interrupted" in printed
     names = {path.name for path in (tmp_path / "run").glob("[!.]*")}
-    assert names >= {"run.json", "checkpoint.zip", "curve.csv", "tensorboard"}
+    assert names >= {"run.json", CHECKPOINT_FILE, "curve.csv", "tensorboard"}
     assert "policy.safetensors" not in names
     run(capsys, *argv)
     assert (tmp_path / "run" / "policy.safetensors").exists()
-    assert not (tmp_path / "run" / "checkpoint.zip").exists()
+    assert not (tmp_path / "run" / CHECKPOINT_FILE).exists()
 
 
 def test_an_interrupted_study_leaves_whole_files(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ import pytest
 from tests.dataset.test_recorder import TWO_SHARDS, contents
 from tests.executors.jobs import CountJob, FileJob
 from tests.executors.test_local import PATIENCE_S, wait_until
+from tint_sumo.checkpoints import CHECKPOINT_FILE
 from tint_sumo.cli import main
 from tint_sumo.config import PpoSettings
 from tint_sumo.dataset.recorder import record
@@ -236,7 +237,7 @@ def test_a_training_survives_a_node_with_its_checkpoint(
     here, job = (TrainJob("no_labels", 0.4, 0, settings, True, tmp_path / name) for name in ("here", "there"))
     Local(1).run([here], progress=False)
     with meanwhile(lambda: cluster.run([job], progress=False)):
-        wait_until((job.folder / "checkpoint.zip").exists)
+        wait_until((job.folder / CHECKPOINT_FILE).exists)
         for _ in range(NODES):  # one of them does the job
             nodes.kill(0)
         nodes.add()

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from tests.traits.interruptions import interrupt_at_step
+from tint_sumo.checkpoints import CHECKPOINT_FILE
 from tint_sumo.cli import main
 from tint_sumo.config import STEP_S, TraitSettings
 from tint_sumo.dataset.schema import MANIFEST, SCHEMA_VERSION
@@ -25,7 +26,6 @@ from tint_sumo.study.budgets import TRAIT_BUDGETS
 from tint_sumo.study.trait_models import train_traits
 from tint_sumo.traits import TRAIT_METHODS, training
 from tint_sumo.traits.storage import read_card
-from tint_sumo.traits.training import CHECKPOINT_FILE
 
 EPISODES = 16  # of each shard
 SMALL = TraitSettings(

@@ -1,11 +1,13 @@
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,11 +16,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import safetensors.torch
 import torch
 
+from tests.bombs import BOMBS, bomb
 from tests.simulation.scenes import T
 from tests.study import runs
 from tint_sumo import traits
+from tint_sumo.checkpoints import CHECKPOINT_FILE, PICKLES
 from tint_sumo.config import PpoSettings, TraitSettings
 from tint_sumo.determinism import preserved_random_state
 from tint_sumo.errors import InputError
@@ -28,7 +33,7 @@ from tint_sumo.policy.storage import load_policy_network, read_policy_card
 from tint_sumo.progress import Progress, Report
 from tint_sumo.study.evaluation import CASE_SEED, evaluate
 from tint_sumo.study.loading import load_policy
-from tint_sumo.study.training import CHECKPOINT_FILE, CURVE_FILE, ZIP_FILE, share_training, train_policy
+from tint_sumo.study.training import CURVE_FILE, ZIP_FILE, share_training, train_policy
 from tint_sumo.traits.storage import save
 
 SNAPSHOTS = ["policy-25.json", "policy-25.safetensors", "policy-50.json", "policy-50.safetensors"]
@@ -279,14 +284,6 @@ def assert_same_training(out: Path, other: Path) -> None:
         assert (out / name).read_bytes() == (other / name).read_bytes(), name
 
 
-def test_a_checkpoint_of_an_earlier_version_is_named(tmp_path: Path, tiny: PpoSettings) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        train_policy("oracle", 0.4, 128, 0, tmp_path, settings=tiny, report=interrupt_at(64))
-    RecurrentPPO.load(tmp_path / CHECKPOINT_FILE).save(tmp_path / CHECKPOINT_FILE)
-    with pytest.raises(InputError, match=r"checkpoint\.zip is of an earlier version; remove it to begin"):
-        train_policy("oracle", 0.4, 128, 0, tmp_path, settings=tiny)
-
-
 @pytest.mark.slow
 def test_a_killed_run_leaves_whole_files_and_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "run"
@@ -301,7 +298,8 @@ def test_a_killed_run_leaves_whole_files_and_goes_on(tmp_path: Path) -> None:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
     assert not (out / "policy.json").exists()
-    done = RecurrentPPO.load(out / CHECKPOINT_FILE).num_timesteps
+    with safetensors.safe_open(out / CHECKPOINT_FILE, "pt") as checkpoint:
+        done = json.loads(checkpoint.metadata()["state"])["decisions"]
     assert runs.STEPS / 4 <= done < runs.STEPS
     assert pd.read_csv(out / CURVE_FILE)["decisions"].is_monotonic_increasing
     told: list[Progress] = []
@@ -315,12 +313,83 @@ def test_a_killed_run_leaves_whole_files_and_goes_on(tmp_path: Path) -> None:
     assert_same_training(out, tmp_path / "at_a_stretch")
 
 
-def test_a_damaged_checkpoint_is_named(tmp_path: Path, tiny: PpoSettings) -> None:
+@pytest.fixture(scope="module")
+def interrupted(tiny: PpoSettings, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a training with a checkpoint after two rollouts; do not write there."""
+    out = tmp_path_factory.mktemp("interrupted") / "run"
     with pytest.raises(KeyboardInterrupt):
-        train_policy("oracle", 0.4, 128, 0, tmp_path, settings=tiny, report=interrupt_at(64))
-    (tmp_path / CHECKPOINT_FILE).write_bytes(b"nonsense")
-    with pytest.raises(InputError, match=CHECKPOINT_FILE):
-        train_policy("oracle", 0.4, 128, 0, tmp_path, settings=tiny)
+        train_policy("vae", 0.4, 512, 0, out, settings=tiny, report=interrupt_at(192))
+    return out
+
+
+def go_on(out: Path, tiny: PpoSettings) -> str:
+    """The line that refuses to go on with a training."""
+    with pytest.raises(InputError) as refused:
+        train_policy("vae", 0.4, 512, 0, out, settings=tiny)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+@pytest.mark.parametrize("kind", BOMBS)
+@pytest.mark.parametrize("name", [CHECKPOINT_FILE, *PICKLES])
+def test_no_checkpoint_can_run_code(interrupted: Path, tmp_path: Path, tiny: PpoSettings, kind: str, name: str) -> None:
+    out = shutil.copytree(interrupted, tmp_path / "run")
+    (out / name).write_bytes(bomb(kind, tmp_path / "marker"))
+    assert f"{out / name} is " in go_on(out, tiny)
+    assert "remove it to begin the training anew" in go_on(out, tiny)
+    assert not (tmp_path / "marker").exists()
+
+
+SPOILT: dict[str, tuple[Callable[[dict[str, torch.Tensor], dict[str, Any]], object], str]] = {
+    "a weight is missing": (lambda tensors, _: tensors.pop("model.action_net.bias"), "no model.action_net.bias"),
+    "a weight has another shape": (
+        lambda tensors, _: tensors.update({"model.action_net.bias": torch.zeros(4)}),
+        r"model.action_net.bias is torch.float32 of \(4,\), not torch.float32 of \(3,\)",
+    ),
+    "a weight is no number": (lambda tensors, _: tensors["model.action_net.bias"].fill_(np.nan), "not finite"),
+    "the optimizer has no numbers": (
+        lambda tensors, _: tensors["optimizer.action_net.bias.exp_avg"].fill_(np.inf),
+        "exp_avg has numbers that are not finite",
+    ),
+    "a trait has another type": (
+        lambda tensors, _: tensors.update({"memory.2.traits": torch.zeros(4, 12, 2, dtype=torch.int64)}),
+        "memory.2.traits is torch.int64",
+    ),
+    "no random numbers": (lambda tensors, _: tensors["generator"].fill_(255), "generator|RNG|state"),
+    "an action is none": (lambda tensors, _: tensors["episodes.actions"].fill_(7), "actions of its episodes"),
+    "actions are missing": (
+        lambda tensors, _: tensors.update({"episodes.actions": torch.zeros(1, dtype=torch.int8)}),
+        "actions of its episodes",
+    ),
+    "fewer environments": (lambda _, state: state["began"].pop(), "environments"),
+    "an outcome is none": (lambda _, state: state.update(recent=["triumph"]), "recent outcomes"),
+    "decisions are none": (lambda _, state: state.update(decisions="many"), "decisions"),
+    "a generator is none": (lambda _, state: state["began"][0].update(state=-1), "state"),
+    "something else": (lambda _, state: state.update(code="import os"), "code"),
+}
+
+
+@pytest.mark.parametrize(("spoil", "message"), SPOILT.values(), ids=SPOILT)
+def test_a_checkpoint_that_does_not_fit_is_named(
+    interrupted: Path, tmp_path: Path, tiny: PpoSettings, spoil: Any, message: str
+) -> None:
+    out = shutil.copytree(interrupted, tmp_path / "run")
+    tensors = safetensors.torch.load_file(out / CHECKPOINT_FILE)
+    with safetensors.safe_open(out / CHECKPOINT_FILE, "pt") as opened:
+        state = json.loads(opened.metadata()["state"])
+    spoil(tensors, state)
+    safetensors.torch.save_file(tensors, out / CHECKPOINT_FILE, {"state": json.dumps(state)})
+    line = go_on(out, tiny)
+    assert line.startswith(f"{out / CHECKPOINT_FILE} is damaged or of another version (")
+    assert re.search(message, line)
+    assert not (out / "policy.json").exists()
+
+
+def test_a_checkpoint_cut_short_is_named(interrupted: Path, tmp_path: Path, tiny: PpoSettings) -> None:
+    out = shutil.copytree(interrupted, tmp_path / "run")
+    content = (out / CHECKPOINT_FILE).read_bytes()
+    (out / CHECKPOINT_FILE).write_bytes(content[: len(content) // 2])
+    assert CHECKPOINT_FILE in go_on(out, tiny)
 
 
 # Folders and arguments

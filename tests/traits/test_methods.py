@@ -1,12 +1,14 @@
 """What every trait method keeps, whatever it learns."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from tint_sumo.traits import TRAIT_METHODS, TraitModel
 from tint_sumo.traits.batches import TrainingWindows, WindowBatch
+from tint_sumo.traits.cross_window import KL_WEIGHT
 from tint_sumo.traits.model import valid_steps
 
 
@@ -72,6 +74,20 @@ def test_every_parameter_learns(model, batch):
     terms["total"].backward()
     idle = {name for name, parameter in model.named_parameters() if parameter.grad is None}
     assert idle == ({"encoder.log_var_head.weight", "encoder.log_var_head.bias"} if model.uses_labels else set())
+
+
+def test_every_term_of_the_loss_is_minimised(model, batch):
+    """With weights that let each be seen: in the paper's settings the divergence is a millionth of the loss."""
+    model.settings = replace(model.settings, kl_weight=3.0, reconstruction_weight=2.0)
+    weights = {"kl": 3.0, "reconstruction": 2.0, "imitation": 2.0}
+    if model.method == "cross_window":
+        weights = {"kl": KL_WEIGHT, "prediction": 1.0}
+    terms = {name: term.item() for name, term in model.loss(batch, torch.Generator().manual_seed(1)).items()}
+    total = terms.pop("total")
+    assert total > 0.0
+    assert model.uses_labels or terms["kl"] > 0.0
+    if not model.uses_labels:
+        assert total == pytest.approx(sum(weights[name] * term for name, term in terms.items()), rel=1e-5)
 
 
 def test_windows_of_two_steps_can_be_learnt_from(model, batch):

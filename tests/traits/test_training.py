@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 import torch
 
+from tests.bombs import BOMBS, bomb
+from tint_sumo.checkpoints import CHECKPOINT_FILE, PICKLES
 from tint_sumo.errors import InputError
 from tint_sumo.traits import TRAIT_METHODS, load, training
 from tint_sumo.traits.classifier import Classifier
 from tint_sumo.traits.evaluation import evaluate
-from tint_sumo.traits.training import CHECKPOINT_FILE, train
+from tint_sumo.traits.training import train
 from tint_sumo.traits.vae import Vae
 
 from .interruptions import interrupt_at_step
@@ -94,8 +96,20 @@ def test_a_damaged_checkpoint_is_reported(windows, small, tmp_path, monkeypatch)
         train(windows, small, tmp_path)
     checkpoint = tmp_path / CHECKPOINT_FILE
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
-    with pytest.raises(InputError, match=r"checkpoint\.pt is damaged; remove it"):
+    with pytest.raises(InputError, match=r"checkpoint\.safetensors is damaged or of another version .*; remove it"):
         train(windows, small, tmp_path)
+
+
+@pytest.mark.parametrize("kind", BOMBS)
+@pytest.mark.parametrize("name", [CHECKPOINT_FILE, *PICKLES])
+def test_no_checkpoint_can_run_code(windows, small, tmp_path, monkeypatch, kind, name):
+    with monkeypatch.context() as interrupted, pytest.raises(KeyboardInterrupt):
+        interrupt_at_step(interrupted, 0)
+        train(windows, small, tmp_path / "run")
+    (tmp_path / "run" / name).write_bytes(bomb(kind, tmp_path / "marker"))
+    with pytest.raises(InputError, match=f"{name} is .*; remove it to begin the training anew"):
+        train(windows, small, tmp_path / "run")
+    assert not (tmp_path / "marker").exists()
 
 
 def test_bad_requests_leave_no_folder(windows, small, tmp_path):

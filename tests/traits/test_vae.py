@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -91,14 +90,6 @@ def test_loss_is_the_weighted_sum_of_its_terms_over_valid_steps(model, batch, mo
     settings = model.settings
     weighted = settings.kl_weight * terms["kl"] + settings.reconstruction_weight * terms["reconstruction"]
     assert terms["total"] == pytest.approx(weighted)
-
-
-def test_both_terms_of_the_loss_are_minimised(model, batch):
-    """With weights that let both be seen: in the paper's settings the divergence is a millionth of the loss."""
-    model.settings = replace(model.settings, kl_weight=3.0, reconstruction_weight=2.0)
-    terms = loss_terms(model, *batch)
-    assert terms["kl"] > 0.0 and terms["reconstruction"] > 0.0
-    assert terms["total"] == pytest.approx(3.0 * terms["kl"] + 2.0 * terms["reconstruction"])
 
 
 def test_latent_noise_comes_from_the_generator_alone(model, batch):

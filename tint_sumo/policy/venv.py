@@ -46,7 +46,7 @@ def policy_venv(
 
 @dataclass(frozen=True)
 class VenvSnapshot:
-    """Where environments made by ``policy_venv`` are, and what is remembered around them; it can be pickled."""
+    """Where environments made by ``policy_venv`` are, and what is remembered around them."""
 
     episodes: list[Snapshot]
     memories: list[dict[str, Any]]  # of each wrapper, from the outermost inwards
@@ -54,9 +54,15 @@ class VenvSnapshot:
 
 def snapshot(venv: VecEnv) -> VenvSnapshot:
     """What ``restore`` needs to come back to where the environments of ``policy_venv`` are, between two decisions."""
-    *wrappers, base = _layers(venv)
+    *_, base = _layers(venv)
     assert isinstance(base, SceneVecEnv)
-    return VenvSnapshot(base.snapshot(), copy.deepcopy([_memory(wrapper) for wrapper in wrappers]))
+    return VenvSnapshot(base.snapshot(), memories(venv))
+
+
+def memories(venv: VecEnv) -> list[dict[str, Any]]:
+    """Return a copy of what the wrappers of ``policy_venv`` remember, from the outermost inwards."""
+    *wrappers, _ = _layers(venv)
+    return copy.deepcopy([_memory(wrapper) for wrapper in wrappers])
 
 
 def restore(venv: VecEnv, there: VenvSnapshot) -> None:

@@ -18,11 +18,12 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits as trait_models
+from tint_sumo.checkpoints import remove_checkpoint, write_checkpoint
 from tint_sumo.config import LATENT_SIZE, PpoSettings, Share, ends, require_share
 from tint_sumo.determinism import preserved_random_state, single_threaded
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
-from tint_sumo.files import claim_folder, whole_file, write_text
+from tint_sumo.files import claim_folder, write_text
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
 from tint_sumo.policy.venv import policy_venv
@@ -30,7 +31,7 @@ from tint_sumo.progress import Progress, Report, silent
 from tint_sumo.provenance import versions
 from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnScene, described, find_scene
 from tint_sumo.study.budgets import SNAPSHOTS_PERCENT
-from tint_sumo.study.checkpoint import load_checkpoint, make_checkpoint
+from tint_sumo.study.checkpoint import make_checkpoint, restore_checkpoint
 from tint_sumo.study.evaluation import CASE_SEED, require_seed
 from tint_sumo.study.methods import Learned, find_learned
 from tint_sumo.training_log import log_film, open_log
@@ -39,7 +40,6 @@ from tint_sumo.traits.storage import read_card, require_scene, save
 
 FilmMaker = Callable[[Path], bytes | None]  # a GIF of the policy in a file; None where there can be none
 
-CHECKPOINT_FILE = "checkpoint.zip"
 CHECKPOINT_INTERVAL_S = 15.0
 POLICY = "policy"  # name of the policy in the folder of a run
 ZIP_FILE = "policy.zip"
@@ -140,7 +140,7 @@ def train_policy(
                 model.save(out / ZIP_FILE)
             save_policy(model.policy, stem, card)
             _log_film(model, stem, film)
-            (out / CHECKPOINT_FILE).unlink(missing_ok=True)
+            remove_checkpoint(out)
         return stem.with_suffix(".safetensors")
 
 
@@ -225,12 +225,9 @@ def _learn(
     report: Report,
 ) -> RecurrentPPO:
     """Train from the checkpoint, if there is one, to ``steps``."""
-    checkpoint = out / CHECKPOINT_FILE
-    if checkpoint.exists():
-        model, recent = load_checkpoint(checkpoint, venv)
-    else:
-        model, recent = new_model(venv, seed, settings), ()
-        venv.seed(_training_seed(seed))
+    model = new_model(venv, seed, settings)
+    venv.seed(_training_seed(seed))
+    recent = restore_checkpoint(out, model)
     done = model.num_timesteps
     told = {key: card[key] for key in ("method", "p_conservative", "scene", "seed", "steps", "settings")}
     model.set_logger(open_log(out, told, [f"rollout/{outcome}" for outcome in OUTCOMES], done))
@@ -328,8 +325,7 @@ class _Watch(BaseCallback):
         """Write the state at the start of the present rollout, if there is one."""
         if self._state:
             self._write_curve()
-            with whole_file(self._out / CHECKPOINT_FILE) as partial:
-                partial.write_bytes(self._state)
+            write_checkpoint(self._out, self._state)
 
     def _write_curve(self) -> None:
         text = io.StringIO()

@@ -3,28 +3,37 @@
 import hashlib
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from tint_sumo.checkpoints import (
+    damage_reported,
+    pack,
+    read_checkpoint,
+    remove_checkpoint,
+    restore_training,
+    training_tensors,
+    write_checkpoint,
+)
 from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.dataset.window_file import WindowFile
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.determinism import preserved_random_state, single_threaded
 from tint_sumo.errors import InputError
-from tint_sumo.files import claim_folder, whole_file
+from tint_sumo.files import claim_folder
 from tint_sumo.progress import Progress, Report, silent
+from tint_sumo.ranges import Range
 from tint_sumo.training_log import open_log
 from tint_sumo.traits.batches import TrainingWindows, WindowBatch
 from tint_sumo.traits.model import TraitModel, find_trait_method
 from tint_sumo.traits.storage import RUN_MODEL, load, save
 
-CHECKPOINT_FILE = "checkpoint.pt"
 CHECKPOINT_INTERVAL_S = 10.0
 MAX_GRAD_NORM = 1.0  # a rare batch must not undo the others
 BFLOAT16_HIDDEN_SIZE = 64  # bfloat16 is faster on CPUs from this size on
@@ -92,8 +101,16 @@ def train(
 
         known = {key: identity[key] for key in ("seed", "windows", "windows_sha256")}
         save(model, out / RUN_MODEL, {**known, "loss": loss, **(card or {})})
-        (out / CHECKPOINT_FILE).unlink(missing_ok=True)
+        remove_checkpoint(out)
         return model.eval().requires_grad_(False)
+
+
+@dataclass(frozen=True)
+class _State:
+    """What a training goes on from beside its tensors."""
+
+    epochs: Annotated[int, Range(0, 2**62)]  # that are finished
+    loss: dict[str, float]  # terms of the last one
 
 
 class _Run:
@@ -115,8 +132,7 @@ class _Run:
         """
         generator = self._generator(0)
         self.model.fit_features(part.with_noise(self.settings.noise_m, generator) for part in self.data.parts())
-        checkpoint = out / CHECKPOINT_FILE
-        done, loss = self._resume(checkpoint)
+        done, loss = self._resume(out)
         settings = {"method": self.model.method, "seed": self.seed, **asdict(self.settings)}
         log = open_log(out, settings, ["loss/total"], done)
         saved_at = time.monotonic()
@@ -127,7 +143,7 @@ class _Run:
                 log.record(f"loss/{name}", value)
             log.dump(epoch + 1)
             if time.monotonic() - saved_at >= CHECKPOINT_INTERVAL_S:
-                self._write_checkpoint(checkpoint, epoch + 1, loss)
+                write_checkpoint(out, self._checkpoint(epoch + 1, loss))
                 saved_at = time.monotonic()
         log.close()
         return loss
@@ -169,27 +185,18 @@ class _Run:
     def _generator(self, stream: int) -> torch.Generator:
         return torch.Generator().manual_seed(_stream_seed(self.seed, stream))
 
-    def _resume(self, checkpoint: Path) -> tuple[int, dict[str, float]]:
-        """Take over ``checkpoint`` if there is one; the number of finished epochs and the last one's loss terms."""
-        if not checkpoint.exists():
+    def _resume(self, out: Path) -> tuple[int, dict[str, float]]:
+        """Go on from the checkpoint if there is one; the number of finished epochs and the last one's loss terms."""
+        found = read_checkpoint(out, _State)
+        if found is None:
             return 0, {}
-        try:
-            state = torch.load(checkpoint, weights_only=True)
-            self.model.load_state_dict(state["model"])
-            self.optimiser.load_state_dict(state["optimiser"])
-            return state["epochs"], state["loss"]
-        except Exception:  # torch.load raises a different type for each kind of damage
-            raise InputError(f"{checkpoint} is damaged; remove it to train from the beginning") from None
+        tensors, state = found
+        with damage_reported(out):
+            restore_training(self.model, self.optimiser, tensors)
+        return state.epochs, state.loss
 
-    def _write_checkpoint(self, checkpoint: Path, epochs: int, loss: dict[str, float]) -> None:
-        state = {
-            "epochs": epochs,
-            "loss": loss,
-            "model": self.model.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-        }
-        with whole_file(checkpoint) as partial:
-            torch.save(state, partial)
+    def _checkpoint(self, epochs: int, loss: dict[str, float]) -> bytes:
+        return pack(training_tensors(self.model, self.optimiser), _State(epochs, loss))
 
 
 def _stream_seed(seed: int, stream: int) -> int:

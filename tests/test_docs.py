@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 from tests.documents import blocks
+from tests.study.browser import FLAGS, require_browser
+from tint_sumo.cli import TintSumo
+from tint_sumo.configuration import subcommands
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.percentages import percent
 from tint_sumo.study.results_csv import read_csv
@@ -61,19 +64,57 @@ def test_a_page_that_does_not_work_is_found(block: str, message: str, tmp_path: 
     assert message in result.stderr
 
 
-def test_the_site_is_built_without_warnings(tmp_path: Path) -> None:
-    """``make docs`` says --strict, too: a warning is an error there."""
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built as ``make docs`` builds it: a warning is an error."""
+    folder = tmp_path_factory.mktemp("docs") / "site"
     beside_python = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     environment = os.environ | {"PATH": beside_python, "NO_MKDOCS_2_WARNING": "1"}
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
     result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
+    return folder
+
+
+def test_the_site_has_all_pages_and_needs_no_network(site: Path) -> None:
     pages = {page.relative_to(DOCS).with_suffix(".html") for page in DOCS.rglob("*.md")}
-    assert all((tmp_path / "site" / page).exists() for page in pages)
-    commands = (tmp_path / "site" / "reference" / "commands.html").read_text(encoding="utf-8")
-    assert "--p-conservative" in commands
-    site = (tmp_path / "site").rglob("*.html")
-    assert not [url for page in site for url in _FETCHED.findall(page.read_text())]  # it is read without a network
+    assert all((site / page).exists() for page in pages)
+    assert "--p-conservative" in (site / "reference" / "commands.html").read_text(encoding="utf-8")
+    assert not [url for page in site.rglob("*.html") for url in _FETCHED.findall(page.read_text())]
+
+
+def test_the_site_is_searched_and_read_from_a_folder(site: Path) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api", reason='needs: pip install "tint_sumo[dev]"')
+    troubles: list[str] = []
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=require_browser(), args=list(FLAGS))
+        page = browser.new_page()
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.on(
+            "request", lambda one: None if one.url.startswith(("file:", "data:", "blob:")) else troubles.append(one)
+        )
+        page.goto((site / "index.html").as_uri())
+        page.click(".md-search__input")
+        page.keyboard.type("headway")
+        page.wait_for_selector(".md-search-result__link")
+        assert "Where it differs from the paper" in str(page.text_content(".md-search-result__list"))
+        page.click(".md-search-result__link >> nth=0")
+        page.wait_for_url("file://**/explanation/*.html*")
+        browser.close()
+    assert troubles == []
+
+
+def command_names(kind: type, before: str = "tint-sumo") -> list[str]:
+    """The names of all commands below a group."""
+    below = subcommands(kind)
+    return [name for word, one in below.items() for name in command_names(one, f"{before} {word}")] or [before]
+
+
+def test_every_command_is_in_the_reference() -> None:
+    reference = (DOCS / "reference" / "commands.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^COLUMNS=100 (tint-sumo .*) --help$", reference, re.MULTILINE)
+    assert sorted(shown) == sorted(command_names(TintSumo))
+    assert re.findall(r"^## (tint-sumo .*)$", reference, re.MULTILINE) == shown
 
 
 def test_the_readme_is_short() -> None:

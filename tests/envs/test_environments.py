@@ -2,16 +2,12 @@
 
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
-from gymnasium.utils.passive_env_checker import env_render_passive_checker
-from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.vec_env import VecMonitor
 
 from tests.simulation.scenes import LOWER
@@ -94,26 +90,6 @@ def test_headways_are_those_asked_for() -> None:
         shares.append(observation["mask"].mean())
         vector.close()
     assert shares[0] > 1.15 * shares[1]
-
-
-def test_gymnasiums_checker(env: SceneEnv) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*not been wrapped.*|.*spec is None.*|.*env.spec.*")
-        check_env(env, skip_render_check=True)
-
-
-def test_gymnasiums_checker_with_rendering() -> None:
-    env = gymnasium.make(ENV_ID, render_mode="rgb_array", tracks=True)
-    check_env(env.unwrapped, skip_render_check=True)  # else it tries all render modes: see test_window
-    env_render_passive_checker(env.unwrapped)
-    env.close()
-
-
-def test_stable_baselines3s_checker(env: SceneEnv) -> None:
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*unconventional shape.*")  # (12, 2): a set of vehicles
-        check_env_sb3(env)
 
 
 def test_one_seed_gives_one_history(env: SceneEnv) -> None:
@@ -344,6 +320,11 @@ def test_rendering_shows_every_vehicle() -> None:
         ({"time_limit_s": float("inf")}, "time_limit_s must be at least a step of 0.1 s, and finite"),
         ({"position_noise_m": -0.1}, "must be finite and not negative"),
         ({"position_noise_m": float("nan")}, "must be finite and not negative"),
+        ({"decision_s": 0.25}, "decision_s must be a multiple of the step of 0.1 s, not 0.25"),
+        ({"decision_s": 0.0}, "decision_s must be a multiple of the step"),
+        ({"decision_s": float("inf")}, "decision_s must be a multiple of the step"),
+        ({"decision_s": float("nan")}, "decision_s must be a multiple of the step"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, not 0"),
         ({"render_mode": "ansi"}, "unknown render_mode 'ansi'; choose one of None, 'human', 'rgb_array'"),
     ],
 )

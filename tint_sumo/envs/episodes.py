@@ -1,8 +1,10 @@
 """Episodes of the navigation task in a batch of intersections: what all environment classes share."""
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,7 @@ from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, find_scene
 from tint_sumo.scenes.geometry import Floats
 from tint_sumo.simulation.own import make_simulation
+from tint_sumo.structures import require_fields
 from tint_sumo.timing import StepPart, does
 
 _SEED_LIMIT = 2**63
@@ -51,6 +54,7 @@ class TaskSettings:
     tau_s: float | None = None
     tracks: bool = False
     decision_s: float | None = None
+    max_episode_steps: int | None = None
     backend: Backend = "auto"
 
     def __post_init__(self) -> None:
@@ -58,29 +62,34 @@ class TaskSettings:
             raise InputError(f"unknown reward preset {self.reward!r}; choose one of {', '.join(REWARD_PRESETS)}")
         if not 0.0 <= self.position_noise_m < math.inf:
             raise InputError(f"position_noise_m must be finite and not negative, not {self.position_noise_m}")
+        steps = self._decision_s / self._step_s
+        if not (math.isfinite(steps) and math.isclose(steps, max(round(steps), 1), rel_tol=_STEP_TOLERANCE)):
+            raise InputError(f"decision_s must be a multiple of the step of {self._step_s:g} s, not {self.decision_s}")
+        if self.max_episode_steps is not None and self.max_episode_steps < 1:
+            raise InputError(f"max_episode_steps must be at least 1, not {self.max_episode_steps}")
         scene = self.played
         if not scene.step_s <= scene.time_limit_s < math.inf:
             raise InputError(
                 f"time_limit_s must be at least a step of {scene.step_s:g} s, and finite, not {scene.time_limit_s}"
             )
-        steps = self._decision_s / scene.step_s
-        if not (math.isfinite(steps) and math.isclose(steps, max(round(steps), 1), rel_tol=_STEP_TOLERANCE)):
-            raise InputError(f"decision_s must be a multiple of the step of {scene.step_s:g} s, not {self.decision_s}")
+
+    @property
+    def _step_s(self) -> float:
+        return find_scene(self.scene).step_s
 
     @property
     def _decision_s(self) -> float:
-        return self.played.step_s if self.decision_s is None else self.decision_s
+        return self._step_s if self.decision_s is None else self.decision_s
 
     @property
     def steps_per_decision(self) -> int:
-        """Simulation steps in each of which an action is taken once more."""
-        return round(self._decision_s / self.played.step_s)
+        """Simulation steps for which an action is held."""
+        return round(self._decision_s / self._step_s)
 
     @property
     def decisions_per_episode(self) -> int:
         """Most decisions in an episode."""
-        scene = self.played
-        return math.ceil(round(scene.time_limit_s / scene.step_s) / self.steps_per_decision)
+        return math.ceil(round(self.played.time_limit_s / self._step_s) / self.steps_per_decision)
 
     @property
     def slot_infos(self) -> tuple[str, ...]:
@@ -93,19 +102,34 @@ class TaskSettings:
         scene = find_scene(self.scene)
         if isinstance(scene, OwnScene):
             return self._own(scene)
-        population, traffic, time_limit_s = scene.population, scene.traffic, scene.time_limit_s
+        population, traffic = scene.population, scene.traffic
         if self.tau_s is not None:
             population = replace(population, idm=replace(population.idm, tau_s=self.tau_s))
         if self.p_conservative is not None:
             traffic = replace(traffic, p_conservative=self.p_conservative)
-        if self.time_limit_s is not None:
-            time_limit_s = self.time_limit_s
-        return replace(scene, traffic=traffic, population=population, time_limit_s=time_limit_s)
+        return replace(scene, traffic=traffic, population=population, time_limit_s=self._time_limit_s(scene))
 
     def _own(self, scene: OwnScene) -> OwnScene:
         if self.p_conservative is not None or self.tau_s is not None:
             raise InputError("the demand of a .sumocfg tells who drives how; leave p_conservative and tau_s out")
-        return scene if self.time_limit_s is None else replace(scene, time_limit_s=self.time_limit_s)
+        return replace(scene, time_limit_s=self._time_limit_s(scene))
+
+    def _time_limit_s(self, scene: Scene | OwnScene) -> float:
+        limit_s = scene.time_limit_s if self.time_limit_s is None else self.time_limit_s
+        if self.max_episode_steps is None:
+            return limit_s
+        return min(limit_s, self.max_episode_steps * self.steps_per_decision * scene.step_s)
+
+
+def require_arguments(environment: type, task: Mapping[str, Any]) -> None:
+    """Raise InputError if an environment class has no such arguments.
+
+    Args:
+        environment: a class whose further arguments are those of ``TaskSettings``.
+        task: the further arguments.
+    """
+    named = [one.name for one in signature(environment).parameters.values() if one.kind is not one.VAR_KEYWORD]
+    require_fields(task, dict.fromkeys([*named, *(field.name for field in fields(TaskSettings))]))
 
 
 def action_space(scene: Scene | OwnScene) -> spaces.Discrete:

@@ -28,6 +28,11 @@ _SEAM_M = 0.06  # half of the line between two lanes
 _VTYPES = ((40, 90, 200), (200, 40, 40), (30, 140, 70), (130, 60, 170), (220, 110, 20), (20, 150, 170), (90, 90, 90))
 
 
+def render_fps(decision_s: float | None) -> float:
+    """Return the images per second that show episodes in real time, one for each step of the environment."""
+    return RENDER_FPS if decision_s is None else 1.0 / decision_s
+
+
 def require_render_mode(render_mode: str | None, choices: Sequence[str]) -> None:
     if render_mode is not None and render_mode not in choices:
         raise InputError(f"unknown render_mode {render_mode!r}; choose one of None, {', '.join(map(repr, choices))}")

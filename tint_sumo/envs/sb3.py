@@ -10,18 +10,20 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from tint_sumo.envs.batch import Snapshot
+from tint_sumo.envs.episodes import require_arguments
 from tint_sumo.envs.rows import end_info, fields_of, observation_of
 from tint_sumo.envs.vector import SceneVectorEnv
+from tint_sumo.scenes import T_INTERSECTION, AnyScene
 from tint_sumo.timing import StepPart, does
 
 
 class SceneVecEnv(VecEnv):
     """Stable-Baselines3 ``VecEnv`` of ``num_envs`` replicas of a scene in one simulation.
 
-    Takes the arguments of ``tint_sumo.envs.scene_env.SceneEnv``. ``infos[i]`` holds ``traits``, the
-    true traits that go with the returned observation; when an episode ends also ``terminal_observation``,
-    ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``is_success``, ``time_s`` and, after a collision,
-    ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then.
+    Takes the arguments of ``tint_sumo.envs.scene_env.SceneEnv``, and ``workers`` as ``SceneVectorEnv`` does.
+    ``infos[i]`` holds ``traits``, the true traits that go with the returned observation; when an episode ends also
+    ``terminal_observation``, ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``is_success``, ``time_s`` and,
+    after a collision, ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then.
     ``slots`` holds arrays (N, V) of what else is known of the vehicles in the returned observations, and
     ``terminal_slots`` the same of the terminal one: ``traits``, and with ``tracks`` also ``position_m``, ``gap_m`` and
     ``passed``.
@@ -29,8 +31,17 @@ class SceneVecEnv(VecEnv):
 
     slots: dict[str, NDArray[Any]]
 
-    def __init__(self, num_envs: int, seed: int | None = None, **settings: Any) -> None:
-        self.env = SceneVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
+    def __init__(
+        self,
+        num_envs: int,
+        seed: int | None = None,
+        scene: AnyScene | Sequence[AnyScene] = T_INTERSECTION,
+        render_mode: str | None = None,
+        workers: int | None = None,
+        **task: Any,
+    ) -> None:
+        require_arguments(SceneVecEnv, task)
+        self.env = SceneVectorEnv(num_envs, scene, render_mode, workers, AutoresetMode.SAME_STEP, **task)
         super().__init__(num_envs, self.env.single_observation_space, self.env.single_action_space)
         self._actions: NDArray[np.int64] = np.zeros(num_envs, np.int64)
         if seed is not None:

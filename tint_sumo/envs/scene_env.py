@@ -1,16 +1,25 @@
 """The single environment."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Snapshot
-from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_actions
-from tint_sumo.envs.rendering import RENDER_FPS, render_scene, require_render_mode
+from tint_sumo.envs.episodes import (
+    Episodes,
+    TaskSettings,
+    action_space,
+    observation_space,
+    require_actions,
+    require_arguments,
+)
+from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, require_render_mode
 from tint_sumo.envs.rows import Observation, fields_of, observation_of, start_info, step_info
-from tint_sumo.envs.window import Window
+from tint_sumo.envs.window import Window, has_display
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
 from tint_sumo.simulation.own import OwnSimulation
@@ -87,6 +96,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
       which each episode draws its probability uniformly, by its seed.
     * `reward`: `"paper"` (default) or `"authors"` (the values of the authors' code).
     * `time_limit_s`: default 50 s.
+    * `max_episode_steps`: gymnasium's way to say it, in steps of the environment. `gymnasium.make` does not pass it on:
+      it wraps the environment in a `TimeLimit`, with which `outcome` stays empty; `gymnasium.make_vec` passes it on.
     * `position_noise_m`: standard deviation of the noise on the others' x and y, independent per vehicle and step.
     * `tau_s`: time headway of the others' car following (SUMO's `tau`); default the scene's, 1 s in the built-in
       ones.
@@ -95,7 +106,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * `decision_s`: an action holds for so long, a multiple of the simulation's step (0.1 s in the built-in scenes), or
       until the episode ends. A step of the environment then is so many steps of the simulation, at each of which the
       controller and its safety check work; `reward` and `reward_terms` are their sums, and everything else is as after
-      the last of them. Default: one step of the simulation.
+      the last of them. Default: one step of the simulation. Policies with traits look at every step of the simulation;
+      they take `tint_sumo.policy.ActionRepeat` instead, which tells how it differs.
     * `backend`: `"libsumo"`, `"traci"` (a sumo subprocess), or `"auto"` (default): libsumo if no other environment of
       this process uses it, since libsumo holds one simulation per process.
     * `render_mode`: `None`, `"rgb_array"`, or `"human"`: a window follows the episodes in real time. It needs a
@@ -116,15 +128,31 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self, scene: str | Scene | OwnScene = T_INTERSECTION, render_mode: str | None = None, **task: Any
     ) -> None:
         require_render_mode(render_mode, self.metadata["render_modes"])
+        require_arguments(SceneEnv, task)
         self.render_mode = render_mode
         settings = TaskSettings(scene, **task)
-        self._window = Window(settings.played.name, RENDER_FPS) if render_mode == "human" else None
+        fps = render_fps(settings.decision_s)
+        modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
+        self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}  # what is possible here
+        self._spec: EnvSpec | None = None
+        self._max_episode_steps = settings.decisions_per_episode
+        self._window = Window(settings.played.name, fps) if render_mode == "human" else None
         self.observation_space = observation_space(settings.played.max_vehicles)
         self.action_space: gymnasium.spaces.Discrete = action_space(settings.played)
         self._slot_infos = settings.slot_infos
         self._episodes = Episodes(1, settings)
         self._began: dict[str, Any] = {}
         self._actions: list[int] = []
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How gymnasium made the environment, with the length of its longest episode, which some wrappers ask for."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        # With max_episode_steps registered, gymnasium.make would wrap the environment in a second time limit.
+        self._spec = spec and replace(spec, max_episode_steps=self._max_episode_steps)
 
     def reset(
         self,

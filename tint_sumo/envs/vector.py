@@ -10,8 +10,14 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Batch, Ended, LocalBatch, Snapshot
-from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space, require_actions
-from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
+from tint_sumo.envs.episodes import (
+    TaskSettings,
+    action_space,
+    observation_space,
+    require_actions,
+    require_arguments,
+)
+from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
 from tint_sumo.envs.rows import (
     GOING_ON,
     REWARD_TERMS,
@@ -76,12 +82,14 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if not 1 <= len(scenes) <= num_envs:
             raise InputError(f"workers must be 1 to num_envs = {num_envs}, not {len(scenes)}")
         require_render_mode(render_mode, self.metadata["render_modes"])
+        require_arguments(SceneVectorEnv, task)
         all_settings = [TaskSettings(one, **task) for one in scenes]
         settings = all_settings[0]
         if len({one.played.max_vehicles for one in all_settings}) > 1:
             raise InputError("scenes of one environment must observe the same number of vehicles; change max_vehicles")
         self._mode = _autoreset_mode(autoreset_mode)
-        self.metadata = {**self.metadata, "autoreset_mode": self._mode}
+        fps = render_fps(settings.decision_s)
+        self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
         self.num_envs = num_envs
         self.slot_infos = settings.slot_infos
         self.render_mode = render_mode

@@ -3,6 +3,7 @@
 It is made with tkinter, which comes with Python, so that watching needs no further package.
 """
 
+import os
 import time
 
 import numpy as np
@@ -11,6 +12,11 @@ from numpy.typing import NDArray
 from tint_sumo.errors import InputError
 
 _INSTEAD = 'use render_mode="rgb_array", or make a film with tint-sumo render'
+
+
+def has_display() -> bool:
+    """Return whether there is a display that a window could be opened on."""
+    return bool(os.environ.get("DISPLAY"))
 
 
 class Window:

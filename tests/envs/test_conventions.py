@@ -1,0 +1,166 @@
+"""What gymnasium and Stable-Baselines3 expect of an environment."""
+
+import warnings
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecMonitor
+
+from tint_sumo import ENV_IDS, SCENE_ENV_ID
+from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.envs.sb3 import SceneVecEnv
+from tint_sumo.errors import InputError
+from tint_sumo.scenes import T_INTERSECTION
+
+ENV_ID = ENV_IDS[T_INTERSECTION]
+GO = 2
+
+
+@pytest.mark.parametrize("env_id", [*ENV_IDS.values(), SCENE_ENV_ID])
+def test_the_checkers_find_nothing_wrong_on_a_machine_without_a_display(
+    env_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with (
+        closing(gymnasium.make(env_id, render_mode="rgb_array", tracks=True, time_limit_s=2.0)) as env,
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+        warnings.filterwarnings("ignore", message=".*unconventional shape.*")  # (V, 2): a set of vehicles
+        check_env_sb3(env.unwrapped)
+
+
+@pytest.mark.parametrize(
+    ("task", "steps"),
+    [({}, 500), ({"time_limit_s": 2.0, "decision_s": 0.3}, 7), ({"time_limit_s": 2.0, "max_episode_steps": 5}, 20)],
+)
+def test_the_longest_episode_stands_in_the_specification(task: dict[str, Any], steps: int) -> None:
+    with closing(gymnasium.make(ENV_ID, **task)) as env:
+        limited = "max_episode_steps" in task  # in gymnasium.make it is a wrapper's
+        assert ("TimeLimit" in str(env)) is limited
+        assert env.unwrapped.spec is not None and env.unwrapped.spec.max_episode_steps == steps
+        spec = env.spec
+        assert spec is not None and spec.max_episode_steps == (5 if limited else steps)
+    with closing(gymnasium.make_vec(spec, num_envs=2, time_limit_s=20.0)) as vector:  # which is passed the steps
+        vector.reset(seed=0)
+        for step in range(1, spec.max_episode_steps + 1 if steps < 500 else 2):
+            *_, truncated, infos = vector.step(np.zeros(2, np.int64))
+            assert truncated.all() == (step == spec.max_episode_steps)
+        assert steps == 500 or set(infos["outcome"]) == {"timeout"}
+    with closing(gymnasium.make(spec)) as again:
+        assert again.spec is not None and again.spec.max_episode_steps == spec.max_episode_steps
+
+
+@pytest.mark.parametrize(
+    ("make", "valid"),
+    [
+        (SceneEnv, "scene, render_mode, p_conservative"),
+        (lambda **task: gymnasium.make(ENV_ID, **task), "scene, render_mode, p_conservative"),
+        (SceneVectorEnv, "num_envs, scene, render_mode, workers, autoreset_mode, p_conservative"),
+        (lambda **task: gymnasium.make_vec(ENV_ID, **task), "num_envs, scene, render_mode, workers, autoreset_mode"),
+        (lambda **task: SceneVecEnv(2, **task), "num_envs, seed, scene, render_mode, workers, p_conservative"),
+    ],
+)
+def test_unknown_arguments_are_answered_with_the_valid_ones(make: Callable[..., Any], valid: str) -> None:
+    with pytest.raises(InputError) as refused:
+        make(p_conservativ=0.3)
+    line = str(refused.value)
+    assert "p_conservativ: there is no such setting; did you mean p_conservative?" in line
+    assert valid in line and "\n" not in line
+
+
+def test_a_vector_for_stable_baselines3_has_but_one_mode() -> None:
+    with pytest.raises(InputError, match="autoreset_mode: there is no such setting"):
+        SceneVecEnv(2, autoreset_mode="Disabled")
+
+
+def test_an_action_holds_for_a_decision_or_until_the_episode_ends() -> None:
+    task: dict[str, Any] = {"scene": "four_way_turn", "p_conservative": 0.5, "time_limit_s": 8.0, "tracks": True}
+    plain, decisive = SceneEnv(**task), SceneEnv(decision_s=0.7, backend="traci", **task)
+    rng = np.random.default_rng(0)
+    outcomes = set()
+    with closing(plain), closing(decisive):
+        for seed in range(6):
+            plain.reset(seed=seed)
+            decisive.reset(seed=seed)
+            ended = False
+            while not ended:
+                action = rng.choice(3, p=(0.2, 0.0, 0.8)) if seed else 0  # the first one does not leave
+                observation, total, *ends, info = decisive.step(action)
+                rewards, terms = [], []
+                for _ in range(7):
+                    expected, reward, *expected_ends, expected_info = plain.step(action)
+                    rewards.append(reward)
+                    terms.append(expected_info.pop("reward_terms"))
+                    if any(expected_ends):
+                        break
+                for name, value in info.pop("reward_terms").items():
+                    assert value == pytest.approx(sum(term[name] for term in terms))
+                assert total == pytest.approx(sum(rewards))
+                assert ends == expected_ends
+                np.testing.assert_equal(observation, expected)
+                np.testing.assert_equal(info, expected_info)
+                ended = any(ends)
+            outcomes.add(info["outcome"])
+    assert outcomes == {"success", "collision", "timeout"}
+
+
+def test_monitor_reads_successes() -> None:
+    env = Monitor(SceneEnv("on_ramp", p_conservative=0.5), info_keywords=("is_success",))
+    outcomes = set()
+    with closing(env):
+        for seed in (0, None, None):
+            env.reset(seed=seed)
+            ended = False
+            while not ended:
+                *_, terminated, truncated, info = env.step(GO)
+                ended = terminated or truncated
+                assert ("is_success" in info) is ended
+            assert info["episode"]["is_success"] is (info["outcome"] == "success")
+            outcomes.add(info["outcome"])
+    assert outcomes == {"success", "collision"}
+
+
+def test_evaluations_read_successes(tmp_path: Path) -> None:
+    task: dict[str, Any] = {"scene": "on_ramp", "p_conservative": 0.5}
+    found: list[str] = []
+
+    class Outcomes(SceneVecEnv):
+        """Writes down how its episodes end."""
+
+        def step_wait(self) -> Any:
+            *returned, infos = super().step_wait()
+            found.extend(info["outcome"] for info in infos if info["outcome"])
+            return *returned, infos
+
+    with closing(VecMonitor(Outcomes(1, seed=0, **task))) as tested, closing(VecMonitor(SceneVecEnv(1, **task))) as env:
+        model = PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, seed=0)
+        model.policy.action_net.bias.data[GO] = 1000.0
+        model.learn(4, EvalCallback(tested, n_eval_episodes=3, eval_freq=4, log_path=str(tmp_path), verbose=0))
+    successes = np.load(tmp_path / "evaluations.npz")["successes"].reshape(-1)
+    assert successes.tolist() == [outcome == "success" for outcome in found]
+    assert successes.tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_gymnasium_makes_vectors_in_every_way(mode: AutoresetMode) -> None:
+    rewards = []
+    for way in ("vector_entry_point", "sync", "async"):
+        told: dict[str, Any] = {"autoreset_mode": mode}
+        kwargs = told if way == "vector_entry_point" else {"vector_kwargs": told}
+        with closing(gymnasium.make_vec(ENV_ID, 2, way, time_limit_s=0.3, **kwargs)) as env:
+            env.reset(seed=5)
+            rewards.append([env.step(np.full(2, GO))[1].tolist() for _ in range(5)])
+    assert rewards[0] == rewards[1] == rewards[2]

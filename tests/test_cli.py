@@ -326,7 +326,7 @@ def test_study_report_names_its_files_as_the_user_does(
         ("policy sweep --set n_epochs=2 --set gamma=0.9 --out OUT", "--set is given twice; give it once"),
         ("study run --workers 0 --out OUT", "workers"),
         ("study report --out NOWHERE", "no results in"),
-        ("render --model always_go --out film.avi", "a film ends in .mp4, .gif, .png"),
+        ("render --model always_go --out film.avi", "film.avi must end in .mp4, .gif or .png"),
         ("render --model always_go --out film.gif --case -1", "case must lie in 0 to 999999, not -1"),
         ("render --model magic --out film.gif", "no policy magic"),
         ("render --model always_go --out film.gif --p-conservative 2", "p_conservative"),

@@ -31,12 +31,14 @@ from tint_sumo.configuration import (
     read_command,
     write_command,
 )
-from tint_sumo.errors import InputError, JobError
+from tint_sumo.errors import BAD_PATHS, InputError, JobError, system_problem
+from tint_sumo.files import PICTURE_SUFFIXES, require_output_file, require_output_folder
 from tint_sumo.percentages import percent
 from tint_sumo.processes import end_quickly, interrupt_on_sigterm
 from tint_sumo.provenance import Origin, made_by
 from tint_sumo.redaction import redact
 from tint_sumo.stores import name_in, working_folder
+from tint_sumo.streams import READER_GONE, flushed_output, has_lost_reader, show_any_name
 from tint_sumo.structures import Many, Where
 
 if TYPE_CHECKING:
@@ -253,11 +255,13 @@ class InspectDataset(Command):
     data: Positional[Path]
     """Folder of a dataset."""
     figure: Path | None = None
-    """Where a PNG of the distributions goes."""
+    """Where a picture of the distributions goes: .png, .jpg, .webp, .svg or .pdf."""
 
     def run(self) -> Outcome:
         from tint_sumo.dataset.inspection import inspect, plot, report
 
+        if self.figure is not None:
+            require_output_file(self.figure, PICTURE_SUFFIXES, "--figure")
         found = inspect(self.data)
         text = report(found)
         if self.figure is not None:
@@ -365,6 +369,7 @@ class PlotTraits(Command):
     def run(self) -> Outcome:
         from tint_sumo.study.trait_models import plot_traits
 
+        require_output_folder(self.out)
         _use_one_thread()
         files = plot_traits(self.data, self.model, self.out, noise_m=self.noise, other_scene=self.other_scene)
         names = [str(file) for file in files]
@@ -387,11 +392,11 @@ class InferTraits(Command):
     """Length of the vehicles in floating-car data, m."""
 
     def run(self) -> Outcome:
-        from tint_sumo.traits.inference import infer_traits, require_table_file, write_table
+        from tint_sumo.traits.inference import SUFFIXES, infer_traits, write_table
 
-        if self.out.resolve() == self.fcd.resolve():
+        if self.out.exists() and self.fcd.exists() and self.out.samefile(self.fcd):
             raise InputError(f"{self.out} holds the data themselves; choose another --out")
-        require_table_file(self.out)
+        require_output_file(self.out, SUFFIXES)
         _use_one_thread()
         table = infer_traits(self.fcd, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length)
         write_table(table, self.out)
@@ -710,9 +715,10 @@ class Render(Command):
 
     def run(self) -> Outcome:
         from tint_sumo.progress import progress_bar
-        from tint_sumo.study.film import render_case
+        from tint_sumo.study.film import render_case, require_film_file
         from tint_sumo.study.loading import load_policy
 
+        require_film_file(self.out)
         _use_one_thread()
         contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
         world = _world(contender, self.p_conservative, self.noise, self.tau)
@@ -802,10 +808,27 @@ class TintSumo:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code is 0, 1 if jobs failed, 2 after bad input, or 130 after Ctrl-C or SIGTERM."""
+    """Run one command and return its exit code.
+
+    It is 0; 1 if jobs failed or the system refused something, such as room on a full disk; 2 after bad input; 130 after
+    Ctrl-C or SIGTERM; or 141 if nobody reads any more what it prints.
+    """
     end_quickly()
     interrupt_on_sigterm()
-    words = list(sys.argv[1:] if argv is None else argv)
+    show_any_name()
+    try:
+        with flushed_output():
+            return _run(list(sys.argv[1:] if argv is None else argv))
+    except OSError as error:
+        if has_lost_reader():
+            return READER_GONE
+        return _refuse(system_problem(error), 2 if isinstance(error, BAD_PATHS) else 1)
+    except UnicodeEncodeError as error:
+        return _refuse(f"a name holds {error.object[error.start]!r}, which is no text; use another name", 1)
+
+
+def _run(words: list[str]) -> int:
+    """Run the command that the words of a command line say, and print what comes out."""
     after_interrupt = Command.after_interrupt
     if words[:1] == ["--print-completion"] and words[1:] in ([shell] for shell in get_args(Shell)):
         print(_completion_script(words[1]), end="")
@@ -819,13 +842,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with made_by(Origin(tuple(words), partial(write_command, command))):
             outcome = command.run()
     except (InputError, JobError) as error:
-        print(f"tint-sumo: error: {redact(str(error))}", file=sys.stderr)
-        return 2 if isinstance(error, InputError) else 1
-    except OSError as error:
-        if error.filename is None:
-            raise
-        print(f"tint-sumo: error: {error.filename}: {error.strerror}; check the path", file=sys.stderr)
-        return 2
+        return _refuse(str(error), 2 if isinstance(error, InputError) else 1)
     except KeyboardInterrupt:
         print("\ntint-sumo: interrupted; all files are whole" + after_interrupt, file=sys.stderr)
         return 130
@@ -833,6 +850,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if command.json:
         print(redact(json.dumps(outcome.content)))
     return 0
+
+
+def _refuse(message: str, exit_code: int) -> int:
+    print(f"tint-sumo: error: {redact(message)}", file=sys.stderr)
+    return exit_code
 
 
 def parse(words: list[str]) -> Command:

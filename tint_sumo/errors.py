@@ -1,5 +1,6 @@
 """The one exception type for mistakes a user can mend, and the mistake of a name that nothing has."""
 
+import errno
 from collections.abc import Mapping
 from typing import TypeVar
 
@@ -23,6 +24,30 @@ def find_named(kind: str, name: str, known: Mapping[str, T]) -> T:
 
 class JobError(RuntimeError):
     """Jobs were given up: which, and why, in one line. The command line exits with code 1 on it."""
+
+
+BAD_PATHS = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError)  # another path mends these
+_NO_ROOM, _NO_RIGHT = "free some space, or choose another folder", "choose a folder that you may write to"
+_REMEDIES = {
+    errno.ENOSPC: _NO_ROOM,
+    errno.EDQUOT: _NO_ROOM,
+    errno.EFBIG: "raise the limit of file sizes (ulimit -f)",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+    errno.ENFILE: "close other programs",
+    errno.EACCES: _NO_RIGHT,
+    errno.EPERM: _NO_RIGHT,
+    errno.EROFS: _NO_RIGHT,
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ENOMEM: "close other programs",
+}
+
+
+def system_problem(error: OSError) -> str:
+    """Return one line that says what the system refused, and how to mend it."""
+    problem = error.strerror or " ".join(str(error).split())
+    parts = (str(error.filename), problem) if error.filename is not None else (problem,)
+    remedy = _REMEDIES.get(error.errno or 0, "check the path" if error.filename is not None else "")
+    return "; ".join(part for part in (": ".join(parts), remedy) if part)
 
 
 RENAMED_METHODS = {"ours": "vae", "ours_plus": "cross_window"}  # what methods were called up to version 0.1

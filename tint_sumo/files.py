@@ -1,10 +1,11 @@
-"""Files that are whole or absent, folders that belong to one run, and the data files the package ships."""
+"""Files that are whole or absent, folders that belong to one run, where commands may write, and shipped files."""
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
+from tempfile import TemporaryFile
 from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
@@ -19,6 +20,8 @@ T = TypeVar("T")
 RUN_FILE = "run.json"
 LOCK_FILE = ".lock"
 LOCK_TIMEOUT_S = 2.0  # workers of a killed process end a moment after it
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".svg", ".pdf")
+MIN_ROOM_BYTES = 10_000_000  # less is a full disk: a study writes more
 _PACKAGE = Path(__file__).resolve().parent
 
 
@@ -32,12 +35,20 @@ def shipped(name: str) -> Path:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; rename it to ``path`` only if the block succeeds."""
+    """Yield a temporary path beside ``path``; rename it to ``path`` only if the block succeeds.
+
+    Raises:
+        OSError: the system refuses to write the file; it names ``path``.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
         partial.replace(path)
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(partial)):
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
     finally:
         partial.unlink(missing_ok=True)
 
@@ -90,6 +101,66 @@ def read_record(path: Path, what: str, kind: type[T]) -> T:
     return found
 
 
+def require_output_file(file: Path, suffixes: Sequence[str], flag: str = "--out") -> None:
+    """Check, before the work begins, that a command can write a file, and may.
+
+    Raises:
+        InputError: the suffix is none of these, no file can be there, or it lies in the folder of a run.
+        OSError: the folder cannot be written to, or has no room.
+    """
+    if file.suffix.lower() not in suffixes:
+        allowed = " or ".join(part for part in (", ".join(suffixes[:-1]), suffixes[-1]) if part)
+        raise InputError(f"{file} must end in {allowed}; choose another {flag}")
+    if file.is_dir() or not _nearest_entry(file.parent).is_dir():
+        raise InputError(f"{file} cannot be a file there; choose another {flag}")
+    _require_no_run(file, flag)
+    _require_writable(file.parent)
+
+
+def require_output_folder(folder: Path, flag: str = "--out") -> None:
+    """Check, before the work begins, that a command can write files into a folder that belongs to no run.
+
+    Raises:
+        InputError: it cannot be a folder, or lies in the folder of a run.
+        OSError: it cannot be written to, or has no room.
+    """
+    if not _nearest_entry(folder).is_dir():
+        raise InputError(f"{folder} is a file, not a folder, or lies below one; choose another {flag}")
+    _require_no_run(folder, flag)
+    _require_writable(folder)
+
+
+def _require_no_run(path: Path, flag: str) -> None:
+    """Raise InputError if ``path`` is the folder of a run or lies in one: nobody else's files may be there."""
+    resolved = path.resolve()
+    for folder in (resolved, *resolved.parents):
+        if (folder / RUN_FILE).exists():
+            raise InputError(f"{path} lies in {folder}, which belongs to a run; choose another {flag}")
+
+
+def _require_writable(folder: Path) -> None:
+    """Check that files of some size can be written into ``folder``, which need not be there yet.
+
+    Raises:
+        InputError: its name is no text, which not all libraries can open.
+        OSError: the system does not allow it, or has no room.
+    """
+    try:
+        str(folder.resolve()).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"the name {str(folder.resolve())!a} is no text in UTF-8; choose another --out") from None
+    try:
+        with TemporaryFile(dir=_nearest_entry(folder)) as file:
+            os.posix_fallocate(file.fileno(), 0, MIN_ROOM_BYTES)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from None
+
+
+def _nearest_entry(path: Path) -> Path:
+    """``path``, or what is there of the folders that it lies in."""
+    return next(entry for entry in (path, *path.absolute().parents) if entry.exists())
+
+
 @contextmanager
 def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bool = True) -> Iterator[None]:
     """In the block, ``folder`` is the home of the run described by ``settings``, a new one or that very run resumed.
@@ -105,9 +176,11 @@ def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bo
 
     Raises:
         InputError: the folder holds another run or files of unknown origin, or another process is working there.
+        OSError: the folder cannot be written to, or has no room.
     """
     wanted = json.loads(json.dumps(settings))
     _require_home(folder, wanted)
+    _require_writable(folder)
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK_FILE, timeout=LOCK_TIMEOUT_S)
     try:

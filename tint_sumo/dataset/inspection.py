@@ -226,7 +226,7 @@ def plot(inspection: Inspection, file: Path) -> None:
     ]
     figure.legend(handles=known, loc="outside lower center", ncols=len(known), frameon=False)
     with whole_file(file) as partial:
-        figure.savefig(partial, format="png")
+        figure.savefig(partial, format=file.suffix.lower().removeprefix("."))
 
 
 def _draw(axes: Axes, distribution: Distribution, colour: Colour, width: float) -> None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from tint_sumo.errors import InputError
-from tint_sumo.files import write_text
+from tint_sumo.files import require_output_folder, write_text
 from tint_sumo.scenes.drivers import DISTRIBUTION_ID, vtypes_xml
 from tint_sumo.scenes.layout import EGO
 from tint_sumo.scenes.network import REPLICA_SPACING_M, build_network, name, plain_xml
@@ -46,11 +46,10 @@ def write_scene(folder: Path, scene: Scene, replicas: int) -> list[Path]:
     """Write the scene's files into ``folder`` and return the paths.
 
     Raises:
-        InputError: a file of the same name exists that this function did not write.
+        InputError: a file of the same name exists that this function did not write, or the folder is a run's.
     """
+    require_output_folder(folder)
     texts = scene_files(scene, replicas)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is a file, not a folder; choose another --out")
     foreign = [file for file in texts if (folder / file).exists() and not _is_ours(folder / file)]
     if foreign:
         raise InputError(f"{folder} holds a {foreign[0]} that tint-sumo did not write; choose another --out")

@@ -11,7 +11,7 @@ from PIL import Image, ImageColor
 from tint_sumo.config import Share, share_words
 from tint_sumo.envs.rendering import RENDER_FPS
 from tint_sumo.errors import InputError
-from tint_sumo.files import whole_file
+from tint_sumo.files import require_output_file, whole_file
 from tint_sumo.progress import Progress, Report, silent
 from tint_sumo.scenes import OwnScene, Scene, find_scene
 from tint_sumo.scenes.layout import layout
@@ -69,13 +69,13 @@ def render_case(
     share = contender.p_conservative if p_conservative is None else p_conservative
     played = require_film_scene(contender)
     moments = list(drive_case(contender, case, seed, p_conservative=share, **task))
-    shown = _spread(moments) if out.suffix == ".png" else moments
+    shown = _spread(moments) if out.suffix.lower() == ".png" else moments
     parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(share))
     has_attention = moments[0].attention is not None
     colour = ImageColor.getrgb(look_of(contender.method).colour)
     artist = Artist(layout(played), (" " * 5).join(parts), colour, fit_reader(contender), has_attention)
     with whole_file(out) as partial:
-        _WRITERS[out.suffix](partial, artist, shown, report)
+        _WRITERS[out.suffix.lower()](partial, artist, shown, report)
     return Film(moments[-1].outcome, round(moments[-1].time_s, 3), len(shown))
 
 
@@ -92,9 +92,8 @@ def require_film_scene(contender: Contender) -> Scene:
 
 def require_film_file(out: Path) -> None:
     """Raise InputError unless a film can be written there."""
-    if out.suffix not in SUFFIXES:
-        raise InputError(f"{out}: a film ends in {', '.join(SUFFIXES)}; choose another --out")
-    if out.suffix == ".mp4":
+    require_output_file(out, SUFFIXES)
+    if out.suffix.lower() == ".mp4":
         try:
             import imageio_ffmpeg  # noqa: F401, PLC0415 - of an extra
         except ImportError:

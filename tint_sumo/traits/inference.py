@@ -11,12 +11,12 @@ from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, STEP_S, VehicleS
 from tint_sumo.dataset.tracks import read_tracks
 from tint_sumo.dataset.windows import cut_windows, steps_in_window
 from tint_sumo.errors import InputError
-from tint_sumo.files import whole_file
+from tint_sumo.files import require_output_file, whole_file
 from tint_sumo.traits.cross_window import CrossWindow, fuse
 from tint_sumo.traits.evaluation import Latents, encode_windows
 from tint_sumo.traits.storage import load
 
-_SUFFIXES = (".csv", ".parquet")
+SUFFIXES = (".csv", ".parquet")
 
 
 def infer_traits(
@@ -72,22 +72,14 @@ def write_table(table: pd.DataFrame, out: Path) -> None:
     """Write CSV or Parquet, by the suffix of ``out``.
 
     Raises:
-        InputError: ``out`` cannot be such a file.
+        InputError: ``out`` cannot be such a file, or lies in the folder of a run.
     """
-    require_table_file(out)
+    require_output_file(out, SUFFIXES)
     with whole_file(out) as partial:
-        if out.suffix == ".csv":
+        if out.suffix.lower() == ".csv":
             table.to_csv(partial, index=False)
         else:
             table.to_parquet(partial, index=False)
-
-
-def require_table_file(out: Path) -> None:
-    """Raise InputError unless a table can be written to ``out``."""
-    if out.suffix not in _SUFFIXES:
-        raise InputError(f"{out} must end in {' or '.join(_SUFFIXES)}; choose another --out")
-    if out.is_dir() or not next(parent for parent in out.parents if parent.exists()).is_dir():
-        raise InputError(f"{out} cannot be a file there; choose another --out")
 
 
 def _columns(prefix: str, latents: Latents) -> dict[str, NDArray[np.float32]]:

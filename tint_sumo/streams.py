@@ -1,0 +1,62 @@
+"""What a command prints: any name can be shown, and errors in writing it show before the interpreter ends."""
+
+import io
+import os
+import select
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+READER_GONE = 141  # exit code of a program that a closed pipe ends: 128 + SIGPIPE
+
+
+def show_any_name() -> None:
+    """Print what the encoding of stdout does not have, such as bytes of a file's name, as escape sequences."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+@contextmanager
+def flushed_output() -> Iterator[None]:
+    """Write out what the block prints.
+
+    Raises:
+        OSError: it cannot be written; the rest of it is dropped.
+    """
+    try:
+        yield
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:  # it is where the command was started with a closed one
+                _flush(stream)
+
+
+def _flush(stream: TextIO) -> None:
+    try:
+        stream.flush()
+    except OSError:
+        _drop(stream)
+        raise
+
+
+def has_lost_reader() -> bool:
+    """Whether stdout or stderr is a pipe from which nobody reads any more."""
+    return any(_has_no_reader(stream) for stream in (sys.stdout, sys.stderr) if stream is not None)
+
+
+def _has_no_reader(stream: TextIO) -> bool:
+    try:
+        descriptor = stream.fileno()
+    except (OSError, ValueError):  # no file stands behind it
+        return False
+    poll = select.poll()
+    poll.register(descriptor, 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
+def _drop(stream: TextIO) -> None:
+    """Let nothing complain when the interpreter flushes the stream once more at its end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)

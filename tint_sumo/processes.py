@@ -41,10 +41,11 @@ def start_worker(
 def worker_context() -> ForkServerContext:
     """Return the multiprocessing context of all workers, with its server running.
 
-    The server loads the modules of this package that this process has loaded when the first worker starts; a worker
-    imports what comes later by itself. The server and the workers never see Ctrl-C, nor SIGTERM before ``begin_work``.
+    The server loads the modules of this package that this process has loaded when the first worker starts, and
+    ``tint_sumo.worker_server``; a worker imports what comes later by itself. The server and the workers never see Ctrl-C, nor SIGTERM before ``begin_work``.
     """
-    _CONTEXT.set_forkserver_preload([name for name in sys.modules if name.startswith("tint_sumo.")])
+    loaded = [name for name in sys.modules if name.startswith("tint_sumo.")]
+    _CONTEXT.set_forkserver_preload([*loaded, "tint_sumo.worker_server"])
     resource_tracker.ensure_running()  # else the server starts it, which would unblock the signals again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_MAIN)
     try:

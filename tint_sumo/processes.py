@@ -42,7 +42,8 @@ def worker_context() -> ForkServerContext:
     """Return the multiprocessing context of all workers, with its server running.
 
     The server loads the modules of this package that this process has loaded when the first worker starts, and
-    ``tint_sumo.worker_server``; a worker imports what comes later by itself. The server and the workers never see Ctrl-C, nor SIGTERM before ``begin_work``.
+    ``tint_sumo.worker_server``; a worker imports what comes later by itself. The server and the workers never see
+    Ctrl-C, nor SIGTERM before ``begin_work``.
     """
     loaded = [name for name in sys.modules if name.startswith("tint_sumo.")]
     _CONTEXT.set_forkserver_preload([*loaded, "tint_sumo.worker_server"])

@@ -112,7 +112,7 @@ class Benchmark:
     gym_env_steps_per_s: float
     cores: tuple[Cores, ...]
     record_windows_per_s: float
-    peak_rss_mib: float  # peak of all of the recorder's processes together
+    peak_memory_mib: float  # peak of all of the recorder's processes together; what they share counts once
     windows: int
     memory_growth_mib: float
     train_windows_per_s: dict[str, float]  # by trait method, with one thread
@@ -138,7 +138,7 @@ class Benchmark:
             ("one gymnasium environment", f"{self.gym_env_steps_per_s:,.0f} steps/s"),
             *(row for cores in self.cores for row in cores.rows()),
             (f"recorder, {_RECORD_WORKERS} workers", f"{self.record_windows_per_s:,.0f} windows/s"),
-            ("  its processes' peak memory", f"{self.peak_rss_mib:,.0f} MiB"),
+            ("  its processes' peak memory", f"{self.peak_memory_mib:,.0f} MiB"),
             ("memory growth while stepping", f"{self.memory_growth_mib:+.1f} MiB"),
             *((f"training {method}", f"{speed:,.0f} windows/s") for method, speed in self.train_windows_per_s.items()),
             *(
@@ -339,7 +339,7 @@ def _record(sizes: Sizes) -> dict[str, Any]:
     if process.returncode != 0:
         raise RuntimeError(f"the recorder ended with exit code {process.returncode}")
     windows = json.loads(printed.splitlines()[-1])["windows"]
-    return {"record_windows_per_s": windows / elapsed_s, "peak_rss_mib": max(peak_mib), "windows": windows}
+    return {"record_windows_per_s": windows / elapsed_s, "peak_memory_mib": max(peak_mib), "windows": windows}
 
 
 def _memory(sizes: Sizes) -> dict[str, Any]:
@@ -350,7 +350,7 @@ def _memory(sizes: Sizes) -> dict[str, Any]:
         for goal in (first, last):
             while steps < goal:
                 steps += driven.turn()
-            sizes_mib.append(_rss_mib("self"))
+            sizes_mib.append(_memory_mib("self"))
     return {"memory_growth_mib": sizes_mib[1] - sizes_mib[0]}
 
 
@@ -411,13 +411,13 @@ def _steady_windows(windows: int) -> Windows:
 
 @contextmanager
 def _peak_memory(process_id: int) -> Iterator[list[float]]:
-    """Sample the resident memory, summed up, of a process and its descendants; at least one sample."""
-    samples = [_tree_rss_mib(process_id)]
+    """Sample the memory of a process and its descendants together; at least one sample."""
+    samples = [_tree_memory_mib(process_id)]
     ended = threading.Event()
 
     def sample() -> None:
         while not ended.wait(_SAMPLING_S):
-            samples.append(_tree_rss_mib(process_id))
+            samples.append(_tree_memory_mib(process_id))
 
     thread = threading.Thread(target=sample)
     thread.start()
@@ -428,26 +428,27 @@ def _peak_memory(process_id: int) -> Iterator[list[float]]:
         thread.join()
 
 
-def _tree_rss_mib(process_id: int) -> float:
+def _tree_memory_mib(process_id: int) -> float:
     children: dict[int, list[int]] = {}
     for folder in Path("/proc").glob("[0-9]*"):
-        parent = _status(folder.name).get("PPid")
+        parent = _numbers(folder.name, "status").get("PPid")
         if parent is not None:
             children.setdefault(int(parent), []).append(int(folder.name))
     tree = [process_id]
     for one in tree:
         tree += children.get(one, [])
-    return sum(_rss_mib(str(one)) for one in tree)
+    return sum(_memory_mib(str(one)) for one in tree)
 
 
-def _rss_mib(process: str) -> float:
-    return int(_status(process).get("VmRSS", "0 kB").split()[0]) * 1024 / _MIB
+def _memory_mib(process: str) -> float:
+    """Memory of a process, with its part of what it shares with others (Linux's PSS)."""
+    return int(_numbers(process, "smaps_rollup").get("Pss", "0 kB").split()[0]) * 1024 / _MIB
 
 
-def _status(process: str) -> dict[str, str]:
-    """What Linux tells about a process; empty if it has ended."""
+def _numbers(process: str, file: str) -> dict[str, str]:
+    """Return what a file of Linux says about a process; empty if the process has ended."""
     try:
-        lines = Path("/proc", process, "status").read_text(encoding="utf-8").splitlines()
+        lines = Path("/proc", process, file).read_text(encoding="utf-8").splitlines()
     except (FileNotFoundError, ProcessLookupError):
         return {}
     return {key: value.strip() for key, _, value in (line.partition(":") for line in lines)}

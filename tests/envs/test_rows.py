@@ -117,3 +117,5 @@ def test_tracks_are_seen_with_the_noise_along_the_way() -> None:
     np.testing.assert_allclose(rows["position_m"], [[9.5, 22.2, 30.25, 0.0]])
     np.testing.assert_allclose(rows["gap_m"], [[3.0 + 0.5 + 2.2, 4.0 - 2.2 - 0.5, np.inf, np.inf]])
     np.testing.assert_array_equal(rows["passed"], [[1, 0, 0, 0]])
+    observe_tracks(np.array([4.0]), passed_m, present, route, vehicles, front_m, leader, gap_m, noise_m, rows)
+    assert not rows["passed"].any()

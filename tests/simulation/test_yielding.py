@@ -5,10 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.simulation.scenes import CREEP, GO, LOWER, STEM_M, STEP_S, STOP, UPPER, scene, speeds, stand_at, until
+from tests.simulation.scenes import CREEP, GO, LOWER, STEM_M, STEP_S, STOP, UPPER, T, scene, speeds, stand_at, until
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Traffic
 from tint_sumo.scenes import SCENES, find_scene
+from tint_sumo.scenes.drivers import members
+from tint_sumo.scenes.layout import layout
+from tint_sumo.simulation.ego import Egos
 from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation.slots import Slots
+from tint_sumo.simulation.yielding import Yielding
 
 
 def test_conservative_lower_lane_driver_stops_for_a_claiming_ego() -> None:
@@ -134,3 +139,63 @@ def test_a_collision_is_latched() -> None:
         first = simulation.egos.collision[0]
         speeds(simulation, STOP, seconds=4.0)
         assert simulation.egos.collision[0] is first
+
+
+class Told:
+    """In place of SUMO: tells speeds, and keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.speeds_mps = {0: 2.0, 1: 2.0, 2: 2.0}
+        self.reactions: list[tuple[int, int, bool, float]] = []
+
+    def speed_mps(self, replica: int, slot: int) -> float:
+        return self.speeds_mps[slot]
+
+    def react(self, replica: int, slot: int, reacts: bool, min_gap_m: float) -> None:
+        self.reactions.append((replica, slot, reacts, round(min_gap_m, 6)))
+
+
+@pytest.fixture
+def told() -> tuple[Told, Yielding, Slots, Egos]:
+    """Two replicas; in the second one, slot 0 and 1 hold drivers on the lower lane, of which the first one yields."""
+    link, layout_t, population = Told(), layout(T), members(replace(T.population, members=1))
+    slots, egos = Slots(2, layout_t), Egos(2, layout_t)
+    for slot, (route, member) in enumerate([(LOWER, 0), (LOWER, 1), (UPPER, 0)]):
+        slots.take(1, slot, route, 8.0, member=member, number=slot)
+    return link, Yielding(2, population, layout_t, slots, link), slots, egos  # type: ignore[arg-type]
+
+
+def test_it_is_told_who_yields(told: tuple[Told, Yielding, Slots, Egos]) -> None:
+    assert told[1].yields.tolist() == [[False] * T.max_vehicles, [True, False, True] + [False] * (T.max_vehicles - 3)]
+
+
+def test_told_of_a_claim_the_yielding_drivers_of_that_route_react(told: tuple[Told, Yielding, Slots, Egos]) -> None:
+    link, yielding, _, egos = told
+    gap_m = members(replace(T.population, members=1))[0].min_gap_m
+    yielding.answer(egos)
+    assert not link.reactions
+    egos.claim_changed[1, LOWER] = egos.has_claimed[1, LOWER] = True
+    yielding.answer(egos)
+    assert link.reactions == [(1, 0, True, round(gap_m + T.claim.courtesy_gap_m, 6))]
+    assert np.argwhere(yielding.reacts).tolist() == [[1, 0]]
+    egos.has_claimed[1, LOWER] = False
+    yielding.answer(egos)
+    yielding.answer(egos)
+    assert link.reactions[1:] == [(1, 0, False, round(gap_m, 6))] and not yielding.reacts.any()
+    egos.claim_changed[1] = egos.has_claimed[1] = [False, True]
+    yielding.answer(egos)
+    assert np.argwhere(yielding.reacts).tolist() == [[1, 2]]
+    yielding.leave(1, 2)
+    assert not yielding.reacts.any() and len(link.reactions) == 3
+
+
+@pytest.mark.parametrize(("past_m", "reacts"), [(-1e-6, True), (1e-6, False)])
+def test_told_of_a_claim_a_driver_reacts_if_it_can_still_stop(
+    told: tuple[Told, Yielding, Slots, Egos], past_m: float, reacts: bool
+) -> None:
+    link, yielding, slots, egos = told
+    stopping_m = 2.0 * T.claim.reaction_time_s + 2.0**2 / (2.0 * T.claim.braking_mps2)
+    slots.front_m[1, 0] = layout(T).zones.stop_line_m[LOWER] - stopping_m + past_m
+    egos.claim_changed[1, LOWER] = egos.has_claimed[1, LOWER] = True
+    yielding.answer(egos)
+    assert yielding.reacts[1, 0] == bool(link.reactions) == reacts

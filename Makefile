@@ -1,4 +1,4 @@
-# make install | study | test | test-long | lint | coverage | docs | net | clean
+# make install | study | test | test-long | lint | coverage | mutants | docs | net | clean
 # Another build of torch: make install TORCH=torch
 # Another Python, with an environment of its own beside .venv: make test PYTHON=python3.12
 PYTHON ?= python3
@@ -6,7 +6,7 @@ VENV ?= .venv$(if $(filter-out python3,$(PYTHON)),-$(subst /,-,$(PYTHON:/%=%)))
 TORCH ?=
 BIN := $(VENV)/bin
 
-.PHONY: install study test test-long lint coverage docs net clean
+.PHONY: install study test test-long lint coverage mutants docs net clean
 
 install: $(VENV)/.installed
 
@@ -39,6 +39,9 @@ lint: install
 
 coverage: install
 	$(BIN)/pytest -n 2 --dist worksteal --cov --cov-report=term:skip-covered
+
+mutants: install
+	$(BIN)/python scripts/mutants.py $(MUTANTS)
 
 docs: install
 	PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -155,7 +155,7 @@ store.write("a", b"new")
 def stalling_proxy(endpoint: str, limit: int, stalled: threading.Event) -> Iterator[str]:
     """Address of a way to the server that brings it no more than so many bytes of all that is asked."""
     host, port = endpoint.removeprefix("http://").split(":")
-    left = [limit]
+    left, copying = [limit], list[threading.Thread]()
 
     def copy(source: socket.socket, target: socket.socket, counted: bool) -> None:
         with suppress(OSError):
@@ -175,12 +175,16 @@ def stalling_proxy(endpoint: str, limit: int, stalled: threading.Event) -> Itera
                 here, _ = listener.accept()
                 there = socket.create_connection((host, int(port)))
                 for arguments in ((here, there, True), (there, here, False)):
-                    threading.Thread(target=copy, args=arguments, daemon=True).start()
+                    copying.append(threading.Thread(target=copy, args=arguments, daemon=True))
+                    copying[-1].start()
 
     with socket.create_server(("127.0.0.1", 0)) as listener:
         threading.Thread(target=serve, daemon=True).start()
         yield f"http://127.0.0.1:{listener.getsockname()[1]}"
         listener.shutdown(socket.SHUT_RDWR)
+    for thread in copying:
+        thread.join(30.0)
+        assert not thread.is_alive(), "the server still waits for the rest"
 
 
 @pytest.mark.parametrize("size", [2_000_000, 30_000_000])  # in one request, and in parts
@@ -192,7 +196,6 @@ def test_a_killed_write_leaves_the_old_content_on_a_server(s3_url: str, s3_endpo
         with run_killed(code, [s3_url], {"AWS_ENDPOINT_URL": proxy}) as process:
             assert stalled.wait(30.0)
             process.kill()
-    time.sleep(0.2)
     assert Store(s3_url).files() == {"a": 3}
     assert Store(s3_url).read("a") == b"old"
 

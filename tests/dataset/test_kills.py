@@ -18,7 +18,7 @@ from tint_sumo.dataset.schema import FCD, MANIFEST, TABLES, TRAJECTORIES
 PATIENCE_S = 60.0
 
 # Workers import this, too. Where a file's name ends with the moment, it is cut in half, as if it were just being
-# written, and nothing goes on. Where no moment is given, files take their time, so that a signal comes before the last.
+# written, and nothing goes on. Where no moment is given, nothing goes on before the last file: a signal comes first.
 RECORDING = """
 import os, time
 from pathlib import Path
@@ -27,11 +27,11 @@ from tint_sumo.dataset.recorder import record
 replace = Path.replace
 
 def replace_or_stop(partial, file):
-    if not "{moment}":
-        time.sleep(0.5)
-    elif str(file).endswith("{moment}"):
+    if "{moment}" and str(file).endswith("{moment}"):
         os.truncate(partial, partial.stat().st_size // 2)
         Path("{reached}").touch()
+        time.sleep(600)
+    elif str(file).endswith("manifest.json"):
         time.sleep(600)
     return replace(partial, file)
 

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -99,3 +100,43 @@ def test_latent_noise_comes_from_the_generator_alone(model, batch):
     assert loss_terms(model, *batch) == first
     other = model.loss(WindowBatch(*batch), torch.Generator().manual_seed(4))["reconstruction"].item()
     assert other != first["reconstruction"]
+
+
+def test_offsets_are_decoded_as_running_sums_of_displacements(model, monkeypatch):
+    """Of two windows of three and four steps; what is decoded is given by hand."""
+    states = torch.tensor(
+        [[[0.0, 9.0], [0.5, 8.0], [1.5, 7.0], [0.0, 0.0]], [[0.0, 6.0], [1.0, 5.0], [2.0, 4.0], [3.0, 3.0]]]
+    )
+    length = torch.tensor([3, 4])
+    with torch.no_grad():
+        model.feature_mean.copy_(torch.tensor([0.25, 10.0]))
+        model.feature_scale.copy_(torch.tensor([0.5, 4.0]))
+    decoded = torch.tensor(
+        [[[7.0, 0.0], [1.5, 0.5], [0.5, -0.5], [9.0, 9.0]], [[7.0, 1.0], [0.5, 0.0], [1.5, 0.0], [2.5, 2.0]]]
+    )
+    asked = []
+
+    def decode(latent, steps):
+        asked.append((latent, steps))
+        return decoded
+
+    monkeypatch.setattr(model, "decode", decode)
+    found = model.reconstruct(states, length)
+    assert torch.equal(asked[0][0], model.encode(states, length)[0]) and asked[0][1] == 4
+    assert found[..., 0].tolist() == [[0.0, 1.0, 1.5, 6.25], [0.0, 0.5, 1.5, 3.0]]
+    assert found[..., 1].tolist() == [[10.0, 12.0, 8.0, 46.0], [14.0, 10.0, 10.0, 18.0]]
+    errors_m2 = model.squared_errors_m2(WindowBatch(states, length))
+    assert errors_m2.tolist() == [0.25, 0.0, 0.25, 0.25, 0.0]  # the first step is no error, nor is what stands behind
+
+
+def test_the_decoder_has_the_sizes_of_the_settings(small):
+    model = Vae(replace(small, embedding_sizes=(6, 5), hidden_size=7, decoder_output_size=4), latent_size=3)
+    assert (model.decoder.input_size, model.decoder.hidden_size) == (5, 7)
+    layers = [
+        (layer.in_features, layer.out_features)
+        for part in (model.decoder_embed, model.decoder_output)
+        for layer in part
+        if hasattr(layer, "in_features")
+    ]
+    assert layers == [(5, 6), (6, 5), (7, 4), (4, 2)]
+    assert model.decode(torch.zeros(2, 3), 6).shape == (2, 6, 2)

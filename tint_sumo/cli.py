@@ -22,6 +22,7 @@ from tyro.conf import (
 )
 
 from tint_sumo import ENV_IDS
+from tint_sumo.config import Decisions, Fraction, NoiseM, Processes, Seed, TauS, TrafficSeed, WindowCount
 from tint_sumo.configuration import (
     FromFile,
     commands_named,
@@ -36,6 +37,7 @@ from tint_sumo.files import PICTURE_SUFFIXES, require_output_file, require_outpu
 from tint_sumo.percentages import percent
 from tint_sumo.processes import end_quickly, interrupt_on_sigterm
 from tint_sumo.provenance import Origin, made_by
+from tint_sumo.ranges import Range, require_ranges
 from tint_sumo.redaction import redact
 from tint_sumo.stores import name_in, working_folder
 from tint_sumo.streams import READER_GONE, flushed_output, has_lost_reader, show_any_name
@@ -50,7 +52,8 @@ if TYPE_CHECKING:
 # What a command needs is imported when it runs: --help shall not wait for torch and SUMO.
 # ruff: noqa: PLC0415
 
-ShareFlag = Many[float]  # one probability, or the two ends of a range
+Cases = Annotated[int, Range(1, 1_000_000)]
+ShareFlag = Many[Fraction]  # one probability, or the two ends of a range
 _SCENES = ", ".join(ENV_IDS)
 Shell = Literal["bash", "zsh", "tcsh"]
 _TYRO = (OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff)
@@ -169,7 +172,7 @@ class Net(Command):
     """Build a scene's road network, the drivers and plain SUMO's configuration with netconvert."""
 
     scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
-    replicas: int = 1
+    replicas: Annotated[int, Range(1, 10_000)] = 1
     """Number of intersections in the network."""
     out: Path = Path("sumo_net")
     """Folder for the files; files of the same names are replaced if this command wrote them."""
@@ -194,17 +197,17 @@ class Record(SpreadCommand):
 
     out: FolderOrUrl
     """Folder for the dataset, or a URL such as s3://bucket/folder."""
-    windows: int = 30_000
+    windows: WindowCount = 30_000
     """At least so many windows of up to 20 steps of 0.1 s."""
     p_conservative: ShareFlag = (0.5,)
     """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
     population: PopulationValue = None
     """traits: conservative and aggressive drivers; continuous: desired speeds and gaps without classes; the scene's
     drivers, traits in all that are built in, if not given."""
-    seed: int = 0
+    seed: TrafficSeed = 0
     """Seed of the traffic."""
     scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
-    workers: int = 1
+    workers: Processes = 1
     """Processes of this machine that simulate; the dataset does not depend on their number."""
     format: Literal["parquet", "fcd"] = "parquet"
     """Parquet is always written; fcd: SUMO's floating-car data, too, also for a dataset that is there already."""
@@ -284,9 +287,9 @@ class TrainTraits(Command):
     """vae (the paper's), cross_window and morton learn without labels, classifier with them."""
     budget: TraitBudgetValue = "quick"
     """quick: for about 30,000 windows; full: for some 700,000; paper: the paper's network and 1000 epochs."""
-    noise: float = 0.0
+    noise: NoiseM = 0.0
     """Standard deviation of the noise on every position in training, m."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the training, and of the split into training and test episodes."""
     streaming: bool = False
     """Keep the windows in a file beside the model instead of in memory, for large datasets; the model is the same."""
@@ -322,7 +325,7 @@ class EvaluateTraits(Command):
     """Folder of a dataset; the test episodes are those that training with the model's seed leaves out."""
     model: str
     """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
-    noise: float = 0.0
+    noise: NoiseM = 0.0
     """Standard deviation of the noise on every position, m."""
     other_scene: bool = False
     """Take a model that was trained in another scene, too."""
@@ -361,7 +364,7 @@ class PlotTraits(Command):
     """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
     out: Path
     """Folder for the PNG files."""
-    noise: float = 0.0
+    noise: NoiseM = 0.0
     """Standard deviation of the noise on every position, m."""
     other_scene: bool = False
     """Take a model that was trained in another scene, too."""
@@ -388,7 +391,7 @@ class InferTraits(Command):
     """The table, .csv or .parquet."""
     net: Path | None = None
     """The scenario's .net.xml; without it nobody sees a leader beyond the end of a lane."""
-    vehicle_length: float = 5.0
+    vehicle_length: Annotated[float, Range(0.5, 30.0)] = 5.0
     """Length of the vehicles in floating-car data, m."""
 
     def run(self) -> Outcome:
@@ -415,7 +418,7 @@ class StudyTraits(SpreadCommand):
     """Folder of the comparison, or a URL such as s3://bucket/folder."""
     budget: TraitStudyValue = "full"
     """Sizes of all stages; others can be given in a configuration file."""
-    workers: int = 2
+    workers: Processes = 2
     """Processes of this machine at a time."""
 
     def run(self) -> Outcome:
@@ -440,9 +443,9 @@ class TrainPolicy(Command):
     """Folder for the policy, its card, the training's curve and the TensorBoard log."""
     p_conservative: ShareFlag = (0.1, 0.9)
     """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
-    steps: int | None = None
+    steps: Decisions | None = None
     """Decisions of the policy; those of the budget if not given."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the training, 0 to 1000."""
     budget: PpoBudgetValue = "full"
     """Sizes of the network, settings of PPO and number of decisions. full takes 5 to 8 minutes on a free core."""
@@ -500,13 +503,13 @@ class EvaluatePolicy(SpreadCommand):
     of the policy's training if not given."""
     scene: SceneValue = None
     """Scene; the one the policy was trained in if not given, for always_go and ttc t_intersection."""
-    noise: float = 0.0
+    noise: NoiseM = 0.0
     """Standard deviation of the noise on the others' positions, m."""
-    tau: float | None = None
+    tau: TauS | None = None
     """Time headway of the other drivers, s; the scene's if not given, 1 s in all that are built in."""
-    episodes: int = 500
+    episodes: Cases = 500
     """Number of cases."""
-    seed: int = 0
+    seed: Seed = 0
     """Which set of cases, 0 to 1000."""
     allow_pickle: bool = False
     """Read .zip files, which can run any code: only for files you trust."""
@@ -560,7 +563,7 @@ class SweepPolicy(SpreadCommand):
     """Folder of the sweep, or a URL such as s3://bucket/folder."""
     methods: Many[str] = ("oracle",)
     """Learned methods: no_labels, morton, vae, no_attention, cross_window, streaming, streaming_critic, ma, oracle."""
-    seeds: Many[int] = (0,)
+    seeds: Many[Seed] = (0,)
     """Seeds of the trainings, 0 to 1000."""
     p_conservative: ShareFlag = (0.1, 0.9)
     """Probability in training that a driver is conservative, 0 to 1; two numbers: each episode draws its own between
@@ -568,11 +571,11 @@ class SweepPolicy(SpreadCommand):
     budget: PpoBudgetValue = "full"
     """Sizes of the network, settings of PPO and number of decisions, where --set does not say others."""
     scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
-    episodes: int = 500
+    episodes: Cases = 500
     """Number of cases of each test."""
-    workers: int = 2
+    workers: Processes = 2
     """Processes of this machine at a time."""
-    gpus_per_job: float = 0.0
+    gpus_per_job: Annotated[float, Range(0.0, 64.0)] = 0.0
     """Share of a GPU for each training, with --executor ray and where the cluster has GPUs."""
 
     def run(self) -> Outcome:
@@ -607,9 +610,9 @@ class RunStudy(SpreadCommand):
     out: Annotated[str | None, _PLACE] = None
     """Folder of the study, or a URL such as s3://bucket/folder; runs/<budget> if not given."""
     scene: Annotated[SceneValue, arg(help=f"Scene: {_SCENES}.")] = "t_intersection"
-    workers: int = 2
+    workers: Processes = 2
     """Processes of this machine at a time."""
-    gpus_per_job: float = 0.0
+    gpus_per_job: Annotated[float, Range(0.0, 64.0)] = 0.0
     """Share of a GPU for each training, with --executor ray and where the cluster has GPUs."""
 
     def run(self) -> Outcome:
@@ -676,7 +679,7 @@ class StudyScenes(Command):
     """Folder of the comparison."""
     budget: SceneStudyValue = "full"
     """Sizes of all stages; others can be given in a configuration file."""
-    workers: int = 2
+    workers: Processes = 2
     """Processes of this machine at a time."""
 
     def run(self) -> Outcome:
@@ -700,15 +703,15 @@ class Render(Command):
     p_conservative: ShareFlag | None = None
     """Probability that a driver is conservative, 0 to 1, or two numbers between which the case draws its own; those
     of the policy's training if not given."""
-    case: int = 0
+    case: Annotated[int, Range(0, 999_999)] = 0
     """Number of the case; the same cases as in policy evaluate."""
-    seed: int = 0
+    seed: Seed = 0
     """Which set of cases, 0 to 1000."""
     scene: SceneValue = None
     """Scene; the one the policy was trained in if not given, for always_go and ttc t_intersection."""
-    noise: float = 0.0
+    noise: NoiseM = 0.0
     """Standard deviation of the noise on the others' positions, m; the film shows where they are."""
-    tau: float | None = None
+    tau: TauS | None = None
     """Time headway of the other drivers, s; the scene's if not given, 1 s in all that are built in."""
     allow_pickle: bool = False
     """Read .zip files, which can run any code: only for files you trust."""
@@ -877,6 +880,7 @@ def parse(words: list[str]) -> Command:
     while not isinstance(parsed, Command):
         parsed = parsed.command
     _require_paths(parsed)
+    require_ranges(parsed)
     return parsed
 
 

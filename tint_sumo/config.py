@@ -7,9 +7,11 @@ Sources: "paper" is Liu et al., Learning to Navigate Intersections with Unsuperv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
-from tint_sumo.errors import InputError, find_named
+from tint_sumo.errors import InputError, find_named, shown
+from tint_sumo.ranges import Length, Range, require_ranges
 from tint_sumo.structures import FieldError, Many, ReadBy, Where, build, choose
 
 NO_LEADER_GAP_M = 20.0  # stands for the gap of every driver without a leader, whatever its trait, and caps all gaps
@@ -20,27 +22,39 @@ LATENT_SIZE = 2  # numbers that represent a trait (paper III-B)
 P_CONSERVATIVE = (0.25, 0.4, 0.6)  # driver mixes of the paper's experiments (paper Fig. 4)
 
 MOST_PROFILES = 127  # labels are numbers of one byte
+MOST_VTYPES = 10_000  # in a simulation
+MOST_DECISIONS = 2**22  # of a batch of PPO
 
 POSITION_SCALE_M = 20.0  # positions are observed divided by this (code)
 SPEED_SCALE_MPS = 3.0  # velocities are observed divided by this: the ego's top desired speed
 
 Backend = Literal["auto", "libsumo", "traci"]
-Share = float | tuple[float, float]  # a probability, or the range it is drawn from
 
-
-def require_positive(owner: object, *names: str) -> None:
-    """Raise InputError unless these fields are above 0."""
-    for name in names:
-        if not getattr(owner, name) > 0:
-            raise InputError(f"{name} must be above 0, not {getattr(owner, name)}")
-
-
-def require_at_least(owner: object, lowest: float, *names: str) -> None:
-    """Raise InputError unless these fields, or all items of those that are tuples, are not below ``lowest``."""
-    for name in names:
-        value = getattr(owner, name)
-        if not all(one >= lowest for one in (value if isinstance(value, tuple) else (value,))):
-            raise InputError(f"{name} must be at least {lowest:g}, not {value}")
+# Numbers that several settings have, with what is sensible; larger ones would fill the memory, or are mistakes.
+Fraction = Annotated[float, Range(0.0, 1.0)]
+Share = Fraction | tuple[Fraction, Fraction]  # a probability, or the range it is drawn from
+Seed = Annotated[int, Range(0, 1000)]  # of a training, or of a set of cases
+TrafficSeed = Annotated[int, Range(0, 2**32 - 1)]
+SpeedMps = Annotated[float, Range(0.0, 60.0)]
+DistanceM = Annotated[float, Range(0.0, 1000.0)]
+NoiseM = Annotated[float, Range(0.0, 1000.0)]
+TauS = Annotated[float, Range(0.01, 20.0)]  # with less, drivers cannot keep it; with more, nobody moves
+AccelMps2 = Annotated[float, Range(0.01, 100.0)]
+GainPerS = Annotated[float, Range(0.001, 1000.0)]
+TimeS = Annotated[float, Range(0.01, 86_400.0)]
+WarmUpS = Annotated[float, Range(0.0, 86_400.0)]
+StepS = Annotated[float, Range(0.01, 1.0)]
+Slots = Annotated[int, Range(1, 200)]  # vehicles in an observation
+WindowCount = Annotated[int, Range(1, 100_000_000)]
+Processes = Annotated[int, Range(1, 1024)]
+Gain = Annotated[float, Range(0.001, 1000.0)]
+Weight = Annotated[float, Range(0.0, 1e6)]  # of a term of a loss
+LearningRate = Annotated[float, Range(1e-12, 1e6)]
+Layer = Annotated[int, Range(1, 2048)]
+Layers = Annotated[Many[Layer], Length(0, 8)]
+Decisions = Annotated[int, Range(1, 10**12)]
+DriverSpeedMps = Annotated[float, Range(0.01, 60.0)]  # SUMO writes 0 for less than 0.01
+ArrivalsPerS = Annotated[float, Range(1e-6, 100.0)]
 
 
 def set_floats(owner: object, *names: str) -> None:
@@ -52,25 +66,21 @@ def set_floats(owner: object, *names: str) -> None:
             object.__setattr__(owner, name, number)
 
 
-def require_fraction(owner: object, *names: str) -> None:
-    """Raise InputError unless these fields lie in [0, 1]."""
-    for name in names:
-        if not 0.0 <= getattr(owner, name) <= 1.0:
-            raise InputError(f"{name} must lie in 0 to 1, not {getattr(owner, name)}")
-
-
 def require_distinct(owner: object, *names: str) -> None:
     """Raise InputError unless these fields have one or more values, each of them once."""
     for name in names:
         values = getattr(owner, name)
         if len(set(values)) < max(1, len(values)):
-            raise InputError(f"{name} must be one or more, each of them once, not {list(values)}")
+            raise InputError(f"{name} must be one or more, each of them once, not {shown(list(values))}")
 
 
 @dataclass(frozen=True)
 class VehicleShape:
-    length_m: float = 5.0  # code
-    width_m: float = 2.0  # code
+    length_m: Annotated[float, Range(0.5, 30.0)] = 5.0  # code
+    width_m: Annotated[float, Range(0.3, 5.0)] = 2.0  # code
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -78,25 +88,23 @@ class DriverProfile:
     """One driver trait."""
 
     name: str
-    desired_speed_mps: tuple[float, float]  # uniform in this range (paper IV-A, where it is one speed)
-    min_gap_m: tuple[float, float]  # uniform in this range (paper IV-A)
-    entry_gap_m: tuple[float, float]  # bumper gap behind the leader at placement and entry, uniform (code)
+    desired_speed_mps: tuple[DriverSpeedMps, DriverSpeedMps]  # uniform in this range (paper IV-A: one speed)
+    min_gap_m: tuple[DistanceM, DistanceM]  # uniform in this range (paper IV-A)
+    entry_gap_m: tuple[DistanceM, DistanceM]  # bumper gap behind the leader at placement and entry, uniform (code)
     yields: bool  # whether the driver reacts to an ego that claims its lane (paper IV-A)
     colour: str  # colour of the vehicle in figures and in sumo-gui, "r,g,b"
-    weight: float = 1.0  # share among the profiles that yield as this one does, to the accuracy of whole vTypes
+    weight: Gain = 1.0  # share among the profiles that yield as this one does, to the accuracy of whole vTypes
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[A-Za-z]\w*", self.name):
-            raise InputError(f"name must be of letters, digits and underscores, a letter first, not {self.name!r}")
+        if not re.fullmatch(r"[A-Za-z]\w{0,63}", self.name):
+            raise InputError(f"name must be of letters, digits and underscores, a letter first, not {shown(self.name)}")
+        require_ranges(self)
         for name in ("desired_speed_mps", "min_gap_m", "entry_gap_m"):
             low, high = getattr(self, name)
-            if not 0.0 <= low <= high:
-                raise InputError(f"{name} must be two numbers from low to high, 0 or more, not {low:g} and {high:g}")
-        if self.desired_speed_mps[0] == 0.0:
-            raise InputError("desired_speed_mps must be above 0: nobody would come")
-        if not re.fullmatch(r"\d+,\d+,\d+", self.colour) or max(map(int, self.colour.split(","))) > 255:
-            raise InputError(f'colour must be "red,green,blue", each 0 to 255, not {self.colour!r}')
-        require_positive(self, "weight")
+            if low > high:
+                raise InputError(f"{name} must be two numbers from low to high, not {low:g} and {high:g}")
+        if not re.fullmatch(r"\d{1,3},\d{1,3},\d{1,3}", self.colour) or max(map(int, self.colour.split(","))) > 255:
+            raise InputError(f'colour must be "red,green,blue", each 0 to 255, not {shown(self.colour)}')
 
     @property
     def rgb(self) -> tuple[float, float, float]:
@@ -116,14 +124,14 @@ CONTINUOUS = DriverProfile("continuous", (2.0, 3.4), (0.2, 0.8), (3.0, 6.0), Tru
 class Idm:
     """Intelligent Driver Model parameters shared by all drivers (SUMO's carFollowModel="IDM")."""
 
-    accel_mps2: float = 3.0  # code
-    decel_mps2: float = 2.0  # code
-    emergency_decel_mps2: float = 9.0  # code
-    tau_s: float = 1.0  # SUMO; the paper gives none, the code has 1.5
-    delta: float = 4.0  # code
+    accel_mps2: AccelMps2 = 3.0  # code
+    decel_mps2: AccelMps2 = 2.0  # code
+    emergency_decel_mps2: AccelMps2 = 9.0  # code
+    tau_s: TauS = 1.0  # SUMO; the paper gives none, the code has 1.5
+    delta: Annotated[float, Range(0.1, 100.0)] = 4.0  # code
 
     def __post_init__(self) -> None:
-        require_positive(self, "accel_mps2", "decel_mps2", "emergency_decel_mps2", "delta")
+        require_ranges(self)
         if self.emergency_decel_mps2 < self.decel_mps2:
             raise InputError(
                 f"emergency_decel_mps2 must be at least decel_mps2 ({self.decel_mps2:g}), "
@@ -136,8 +144,8 @@ class Population:
     """The vTypes drivers are drawn from."""
 
     profiles: Many[DriverProfile] = DRIVER_PROFILES
-    members: int = 32  # vTypes of a profile of weight 1, each with its own draws
-    seed: int = 2022  # seed of the draws
+    members: Annotated[int, Range(1, MOST_VTYPES)] = 32  # vTypes of a profile of weight 1, each with its own draws
+    seed: TrafficSeed = 2022  # seed of the draws
     idm: Idm = Idm()
 
     def __post_init__(self) -> None:
@@ -146,8 +154,10 @@ class Population:
             raise InputError(f"profiles must be 1 to {MOST_PROFILES}, not {len(names)}")
         if len(set(names)) < len(names):
             raise InputError(f"profiles must have names of their own, not {', '.join(names)}")
-        require_at_least(self, 1, "members")
-        require_at_least(self, 0, "seed")
+        require_ranges(self)
+        vtypes = sum(max(1, round(self.members * profile.weight)) for profile in self.profiles)
+        if vtypes > MOST_VTYPES:
+            raise InputError(f"members times the weights of profiles must be {MOST_VTYPES:,} at most, not {vtypes:,}")
 
 
 POPULATIONS = {"traits": Population(), "continuous": Population((CONTINUOUS,), members=512)}
@@ -220,7 +230,7 @@ class Traffic:
     """How drivers appear on the street."""
 
     p_conservative: Share = 0.4  # probability that a driver is conservative; a range: drawn uniformly per episode
-    arrivals_per_s: float | None = None  # Poisson rate per lane; None: saturated, enter as soon as there is room
+    arrivals_per_s: ArrivalsPerS | None = None  # Poisson rate per lane; None: saturated, enter as soon as there is room
 
     @property
     def p_conservative_range(self) -> tuple[float, float]:
@@ -233,31 +243,30 @@ class Traffic:
 
     def __post_init__(self) -> None:
         require_share(self.p_conservative)
-        if self.arrivals_per_s is not None and not self.arrivals_per_s > 0.0:
-            raise InputError(
-                f"arrivals_per_s must be positive, or None for saturated traffic, not {self.arrivals_per_s}"
-            )
+        require_ranges(self)
 
 
 @dataclass(frozen=True)
 class EgoController:
     """The ego's low-level control (code): a PD law on speed, and a safety check that overrides it."""
 
-    desired_speeds_mps: Many[float] = (0.0, 0.5, 3.0)  # the actions (paper III-C)
-    gain_per_s: float = 2.0
-    accel_limit_mps2: float = 3.0
-    unsafe_distance_m: float = 0.8  # distance between vehicle boxes
-    closing_distance_m: float = 1.0  # unsafe if also closing faster than closing_speed_mps
-    closing_speed_mps: float = 1.0
+    desired_speeds_mps: Annotated[Many[SpeedMps], Length(2, 100)] = (0.0, 0.5, 3.0)  # the actions (paper III-C)
+    gain_per_s: GainPerS = 2.0
+    accel_limit_mps2: AccelMps2 = 3.0
+    unsafe_distance_m: DistanceM = 0.8  # distance between vehicle boxes
+    closing_distance_m: DistanceM = 1.0  # unsafe if also closing faster than closing_speed_mps
+    closing_speed_mps: SpeedMps = 1.0
     watches_behind: bool = True  # whether vehicles behind the ego count, too (code)
-    braking_gain_per_s: float = 5.0
-    braking_limit_mps2: float = 6.0
+    braking_gain_per_s: GainPerS = 5.0
+    braking_limit_mps2: AccelMps2 = 6.0
 
     def __post_init__(self) -> None:
-        if len(self.desired_speeds_mps) < 2:
-            raise InputError("desired_speeds_mps must be at least two speeds, the first one slow enough to wait")
-        require_at_least(self, 0, "desired_speeds_mps", "unsafe_distance_m", "closing_distance_m", "closing_speed_mps")
-        require_positive(self, "gain_per_s", "accel_limit_mps2", "braking_gain_per_s", "braking_limit_mps2")
+        require_ranges(self)
+        if any(after <= before for before, after in pairwise(self.desired_speeds_mps)):
+            speeds = list(self.desired_speeds_mps)
+            raise InputError(
+                f"desired_speeds_mps must rise from the slowest, which waits, to the fastest, not {speeds}"
+            )
 
 
 @dataclass(frozen=True)
@@ -272,15 +281,14 @@ class Claim:
     """
 
     by: Literal["front", "box"] = "front"  # the part of the ego that enters the lane; the code takes the front
-    approach_speed_mps: float = 0.5  # speed towards the lane that counts as moving in
-    path_margin_m: float = 1.0  # an ego that is this far past a lane's border stands in the vehicles' path
-    courtesy_gap_m: float = 1.5  # yielding drivers add this to their minGap while their lane is claimed
-    reaction_time_s: float = 0.1  # time before a driver brakes: one step
-    braking_mps2: float = 6.0  # a driver is ready to brake so hard; an emergency has 9 m/s2
+    approach_speed_mps: SpeedMps = 0.5  # speed towards the lane that counts as moving in
+    path_margin_m: DistanceM = 1.0  # an ego that is this far past a lane's border stands in the vehicles' path
+    courtesy_gap_m: DistanceM = 1.5  # yielding drivers add this to their minGap while their lane is claimed
+    reaction_time_s: Annotated[float, Range(0.0, 60.0)] = 0.1  # time before a driver brakes: one step
+    braking_mps2: AccelMps2 = 6.0  # a driver is ready to brake so hard; an emergency has 9 m/s2
 
     def __post_init__(self) -> None:
-        require_at_least(self, 0, "approach_speed_mps", "path_margin_m", "courtesy_gap_m", "reaction_time_s")
-        require_positive(self, "braking_mps2")
+        require_ranges(self)
 
     def stopping_distance_m(self, speed_mps: float) -> float:
         """Distance in which a driver at this speed is ready to stop."""
@@ -305,42 +313,37 @@ REWARD_PRESETS = {
 class TraitSettings:
     """The paper's trait network and its training; every trait method takes what it needs of it."""
 
-    embedding_sizes: Many[int] = (32, 64)  # code; () feeds the features to the GRU as they are
-    hidden_size: int = 256  # code
-    encoder_output_size: int = 256  # code
-    decoder_output_size: int = 128  # code
-    kl_weight: float = 5e-8  # paper IV-B; the code has 5e-7
-    reconstruction_weight: float = 10.0  # code
-    learning_rate: float = 5e-4  # decays linearly to zero (paper IV-B)
-    weight_decay: float = 1e-6  # code
-    batch_size: int = 1024  # code
-    epochs: int = 1000  # paper IV-B
-    noise_m: float = 0.0  # standard deviation of the noise on every position in training, drawn anew in each epoch
+    embedding_sizes: Layers = (32, 64)  # code; () feeds the features to the GRU as they are
+    hidden_size: Layer = 256  # code
+    encoder_output_size: Layer = 256  # code
+    decoder_output_size: Layer = 128  # code
+    kl_weight: Weight = 5e-8  # paper IV-B; the code has 5e-7
+    reconstruction_weight: Weight = 10.0  # code
+    learning_rate: LearningRate = 5e-4  # decays linearly to zero (paper IV-B)
+    weight_decay: Weight = 1e-6  # code
+    batch_size: Annotated[int, Range(1, 1_000_000)] = 1024  # code
+    epochs: Annotated[int, Range(1, 1_000_000)] = 1000  # paper IV-B
+    noise_m: NoiseM = 0.0  # standard deviation of the noise on every position in training, drawn anew in each epoch
 
     def __post_init__(self) -> None:
-        sizes = ("embedding_sizes", "hidden_size", "encoder_output_size", "decoder_output_size")
-        require_at_least(self, 1, *sizes, "batch_size", "epochs")
-        require_at_least(self, 0, "kl_weight", "reconstruction_weight", "weight_decay", "noise_m")
-        require_positive(self, "learning_rate")
+        require_ranges(self)
 
 
 @dataclass(frozen=True)
 class PolicySettings:
     """The paper's policy network."""
 
-    embedding_sizes: Many[int] = (150, 100)  # code
-    score_sizes: Many[int] = (100, 100)  # code
-    context_size: int = 50  # code
-    joint_sizes: Many[int] = (150, 100, 64)  # code
-    hidden_size: int = 256  # code
-    head_sizes: Many[int] = (256, 256)  # code
+    embedding_sizes: Layers = (150, 100)  # code
+    score_sizes: Layers = (100, 100)  # code
+    context_size: Layer = 50  # code
+    joint_sizes: Layers = (150, 100, 64)  # code
+    hidden_size: Layer = 256  # code
+    head_sizes: Layers = (256, 256)  # code
     attention: bool = True  # without it, all vehicles count the same (the paper's ablation, IV-D)
-    position_gain: float = 1.0  # positions are multiplied by this; observed in units of 20 m, they differ by little
+    position_gain: Gain = 1.0  # positions are multiplied by this; observed in units of 20 m, they differ by little
 
     def __post_init__(self) -> None:
-        sizes = ("embedding_sizes", "score_sizes", "context_size", "joint_sizes", "hidden_size", "head_sizes")
-        require_at_least(self, 1, *sizes)
-        require_positive(self, "position_gain")
+        require_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -351,29 +354,30 @@ class PpoSettings:
     ``total_steps`` then count decisions.
     """
 
-    n_envs: int = 12  # paper
-    n_steps: int = 30  # paper
-    n_epochs: int = 5
-    n_minibatches: int = 2
-    learning_rate: float = 1e-4  # decays linearly to zero (paper)
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip_range: float = 0.2
-    ent_coef: float = 0.01  # entropy weight at the beginning
-    final_ent_coef: float = 0.01  # entropy weight at the end; in between it changes linearly
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
-    total_steps: int = 10_000_000  # paper
+    n_envs: Annotated[int, Range(1, 4096)] = 12  # paper
+    n_steps: Annotated[int, Range(1, 65_536)] = 30  # paper
+    n_epochs: Annotated[int, Range(1, 1000)] = 5
+    n_minibatches: Annotated[int, Range(1, 4096)] = 2
+    learning_rate: LearningRate = 1e-4  # decays linearly to zero (paper)
+    gamma: Fraction = 0.99
+    gae_lambda: Fraction = 0.95
+    clip_range: Annotated[float, Range(1e-6, 1e6)] = 0.2
+    ent_coef: Weight = 0.01  # entropy weight at the beginning
+    final_ent_coef: Weight = 0.01  # entropy weight at the end; in between it changes linearly
+    vf_coef: Weight = 0.5
+    max_grad_norm: Annotated[float, Range(1e-6, 1e9)] = 0.5
+    total_steps: Decisions = 10_000_000  # paper
     policy: PolicySettings = field(default_factory=PolicySettings)
-    action_repeat: int = 1  # paper: a decision every step
-    time_limit_s: float = 50.0  # limit of training episodes if the scene's is not shorter; evaluation has the scene's
+    action_repeat: Annotated[int, Range(1, 1000)] = 1  # paper: a decision every step
+    time_limit_s: TimeS = 50.0  # limit of training episodes if the scene's is not shorter; evaluation has the scene's
 
     def __post_init__(self) -> None:
-        counts = ("n_envs", "n_steps", "n_epochs", "n_minibatches", "total_steps", "action_repeat")
-        require_at_least(self, 1, *counts)
-        require_at_least(self, 0, "ent_coef", "final_ent_coef", "vf_coef")
-        require_positive(self, "learning_rate", "clip_range", "max_grad_norm", "time_limit_s")
-        require_fraction(self, "gamma", "gae_lambda")
+        require_ranges(self)
+        if self.n_envs * self.n_steps > MOST_DECISIONS:
+            raise InputError(
+                f"n_envs times n_steps must be {MOST_DECISIONS:,} decisions at most, which are in memory at a time, "
+                f"not {self.n_envs * self.n_steps:,}"
+            )
         if self.n_minibatches > self.n_envs:
             raise InputError(
                 f"n_minibatches must be at most n_envs ({self.n_envs}), whose sequences stay whole, "

@@ -1,10 +1,14 @@
 """The one exception type for mistakes a user can mend, and the mistake of a name that nothing has."""
 
 import errno
+import reprlib
 from collections.abc import Mapping
 from typing import TypeVar
 
 T = TypeVar("T")
+
+_SHOWN = reprlib.Repr()
+_SHOWN.maxstring = _SHOWN.maxother = 80
 
 
 class InputError(ValueError):
@@ -20,6 +24,11 @@ def find_named(kind: str, name: str, known: Mapping[str, T]) -> T:
     if name not in known:
         raise InputError(f"unknown {kind} {name!r}; choose one of: {', '.join(known)}")
     return known[name]
+
+
+def shown(value: object) -> str:
+    """Return a value as Python writes it, cut to what fits into a message."""
+    return _SHOWN.repr(value)
 
 
 class JobError(RuntimeError):

@@ -6,7 +6,7 @@ from numbers import Real
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, shown
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,38 @@ class Range:
             InputError: it is no number in this range.
         """
         if not isinstance(value, Real) or not self.low <= value <= self.high:  # type: ignore[operator]
-            raise InputError(f"must be {self}, not {value}")
+            raise InputError(f"must lie in {_digits(self.low)} to {_digits(self.high)}, not {shown(value)}")
         return value
+
+    def require(self, name: str, value: Any) -> None:
+        """Raise InputError, which begins with ``name``, unless the value is a number in this range."""
+        try:
+            self.check(value)
+        except InputError as error:
+            raise InputError(f"{name} {error}") from None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic_core import core_schema  # noqa: PLC0415 - where files are read, and nowhere else
 
         return core_schema.no_info_after_validator_function(self.check, handler(source))
+
+
+@dataclass(frozen=True)
+class Length(Range):
+    """Of a tuple: it has so many items."""
+
+    def __str__(self) -> str:
+        return f"({_digits(self.low)} to {_digits(self.high)} of them)"
+
+    def check(self, value: Any) -> Any:
+        """Return the value.
+
+        Raises:
+            InputError: it has fewer or more items.
+        """
+        if not self.low <= len(value) <= self.high:
+            raise InputError(f"must have {_digits(self.low)} to {_digits(self.high)} values, not {len(value)}")
+        return value
 
 
 def require_ranges(owner: Any) -> None:

@@ -1,7 +1,6 @@
 """Dataclasses from what a file says, and back. Pydantic checks the types; its errors become one clear line each."""
 
 import json
-import reprlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
@@ -10,7 +9,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, shown
 from tint_sumo.ranges import Range
 
 if TYPE_CHECKING:
@@ -32,8 +31,6 @@ _WORDS = {
     dict: "a mapping",
     Any: "anything",
 }
-_SHOWN = reprlib.Repr()
-_SHOWN.maxstring = _SHOWN.maxother = 80
 _MOST_OTHERS = 5  # further errors that a message names
 
 
@@ -73,7 +70,7 @@ class OneOrMany:
             try:
                 return build(source, [value])
             except FieldError:
-                raise FieldError((), f"must be {_words(source)}, not {_shown(value)}") from None
+                raise FieldError((), f"must be {_words(source)}, not {shown(value)}") from None
 
         return ReadBy(read).__get_pydantic_core_schema__(source, handler)
 
@@ -162,7 +159,7 @@ def is_mapping(value: Any, named: Mapping[str, Any], where: Where) -> bool:
         FieldError: it gives neither.
     """
     if not isinstance(value, str | Mapping):
-        raise FieldError(where, f"must be a name ({', '.join(named)}) or a mapping of settings, not {_shown(value)}")
+        raise FieldError(where, f"must be a name ({', '.join(named)}) or a mapping of settings, not {shown(value)}")
     return isinstance(value, Mapping)
 
 
@@ -182,8 +179,8 @@ def require_known(name: Any, known: Mapping[str, Any] | Sequence[str], where: Wh
         FieldError: it is not.
     """
     if not isinstance(name, str) or name not in known:
-        nearest, known_names = _nearest(str(name), known), ", ".join(known)
-        raise FieldError(where, f"is not known: {_shown(name)}{nearest}; choose one of: {known_names}")
+        nearest, known_names = _nearest(str(name)[:80], known), ", ".join(known)
+        raise FieldError(where, f"is not known: {shown(name)}{nearest}; choose one of: {known_names}")
     return name
 
 
@@ -232,7 +229,7 @@ def _field_error(kind: Any, errors: Iterable[Mapping[str, Any]], where: Where) -
         else:
             if error["type"] == "missing":  # a tuple is too short
                 place, expected, union = _find(kind, error["loc"][1:-1])
-            text = f"must be {_words(expected)}, not {_shown(error['input'])}"
+            text = f"must be {_words(expected)}, not {shown(error['input'])}"
             (of_unions if place == union else found).setdefault(place, text)
     found |= {place: f"{', '.join(names)} must be given" for place, names in missing.items()}
     found |= {at: text for at, text in of_unions.items() if not any(one[: len(at)] == at for one in found)}
@@ -317,8 +314,3 @@ def _unknown(name: str, known: Sequence[str]) -> str:
 def _nearest(name: str, known: Mapping[str, Any] | Sequence[str]) -> str:
     found = get_close_matches(name.replace("-", "_"), list(known), n=1)
     return f"; did you mean {found[0]}?" if found else ""
-
-
-def _shown(value: Any) -> str:
-    """A value for people, no longer than a line."""
-    return _SHOWN.repr(value)

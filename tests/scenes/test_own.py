@@ -64,9 +64,9 @@ def test_long_steps_do_not_make_the_ego_overshoot(own_network: Make) -> None:
         ({"goal_m": 10.0}, "one behind the other"),
         ({"start_m": -1.0}, "one behind the other"),
         ({"goal_m": 1e4}, "one behind the other"),
-        ({"max_vehicles": 0}, "max_vehicles must be at least 1"),
-        ({"sight_m": float("nan")}, "sight_m must be finite"),
-        ({"warm_up_s": -1.0}, "warm_up_s must be"),
+        ({"max_vehicles": 0}, "max_vehicles must lie in 1 to 200"),
+        ({"sight_m": float("nan")}, "sight_m must lie in 0 to 1000"),
+        ({"warm_up_s": -1.0}, "warm_up_s must lie in"),
     ],
 )
 def test_bad_tasks_are_refused(changes: dict[str, object], message: str, merge: OwnNetwork) -> None:

@@ -197,7 +197,7 @@ def test_shipped_policies_are_tested_where_the_budget_says_so(
 
 
 def test_unknown_methods_and_too_few_workers_leave_no_folder(budget: Budget, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="workers must be at least 1"):
+    with pytest.raises(InputError, match="workers must lie in 1 to 1,024"):
         run_study(budget, tmp_path / "study", workers=0)
     for name in ("magic", "ours"):
         with pytest.raises(InputError, match=f"{name}"):

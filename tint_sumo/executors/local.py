@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 from multiprocessing import connection
 from typing import TypeVar
 
-from tint_sumo.errors import InputError
+from tint_sumo.config import Processes
 from tint_sumo.executors.jobs import Begun, Ended, Job, News, Work, run_jobs
 from tint_sumo.executors.process import JobProcess
 from tint_sumo.processes import begin_work, worker_context
+from tint_sumo.ranges import require_ranges
 
 T = TypeVar("T")
 
@@ -20,11 +21,10 @@ T = TypeVar("T")
 class Local:
     """An executor of so many processes; a single one does pieces of work in this very process."""
 
-    workers: int = 1
+    workers: Processes = 1
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise InputError(f"workers must be at least 1, not {self.workers}")
+        require_ranges(self)
 
     @property
     def slots(self) -> int:

@@ -9,7 +9,7 @@ from collections import namedtuple
 from collections.abc import Mapping
 from dataclasses import fields
 from numbers import Real
-from typing import Any
+from typing import Any, get_args
 
 # Version 1. What is listed here, and in which order, makes the text that is hashed: a change gives all scenes another
 # digest, so that what was trained before is refused. Drivers, their mix and the time limit do not count.
@@ -66,6 +66,6 @@ def _plain(value: Any) -> Any:
 
 def _values(owner: Any, kind: str) -> dict[str, Any]:
     """Return the listed values of a dataclass by their names."""
-    counts = {field.name for field in fields(owner) if field.type is int}
+    counts = {field.name for field in fields(owner) if (get_args(field.type) or [field.type])[0] is int}
     values = {name: getattr(owner, name) for name in _LISTED[kind]}
     return {name: int(value) if name in counts else _plain(value) for name, value in values.items()}

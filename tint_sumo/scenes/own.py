@@ -17,8 +17,9 @@ from xml.sax import SAXException
 
 import sumolib
 
-from tint_sumo.config import Claim, EgoController, VehicleShape
+from tint_sumo.config import Claim, DistanceM, EgoController, Slots, TimeS, VehicleShape, WarmUpS
 from tint_sumo.errors import InputError
+from tint_sumo.ranges import require_ranges
 from tint_sumo.reading import TABLE_BYTES, require_file
 from tint_sumo.scenes.scene import EgoTask
 
@@ -79,12 +80,15 @@ class OwnScene:
     start_m: float
     goal_m: float
     route_edge_start_m: tuple[float, ...]  # start of each edge along the route
-    max_vehicles: int = 12
-    sight_m: float = 50.0
-    warm_up_s: float = 30.0  # the traffic runs for so long before the ego appears
-    time_limit_s: float = 50.0
+    max_vehicles: Slots = 12
+    sight_m: DistanceM = 50.0
+    warm_up_s: WarmUpS = 30.0  # the traffic runs for so long before the ego appears
+    time_limit_s: TimeS = 50.0
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     controller: EgoController = field(default_factory=EgoController)
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
 
     @property
     def step_s(self) -> float:
@@ -149,11 +153,6 @@ def from_sumocfg(
     if not any(first_m <= start_m <= last_m for first_m, last_m in spans_m):
         ends = ", ".join(f"{first_m:.1f} to {last_m:.1f}" for first_m, last_m in spans_m)
         raise InputError(f"the ego's start ({start_m:g} m) is on a junction; its route's edges are at {ends} m")
-    for value, what in ((sight_m, "sight_m"), (warm_up_s, "warm_up_s"), (time_limit_s, "time_limit_s")):
-        if not 0.0 <= value < math.inf:
-            raise InputError(f"{what} must be finite and not negative, not {value}")
-    if max_vehicles < 1:
-        raise InputError(f"max_vehicles must be at least 1, not {max_vehicles}")
     return OwnScene(
         name=config.name,
         config=config,
@@ -213,8 +212,8 @@ def _seconds(text: str, file: Path) -> float:
             step_s = step_s * 60.0 + float(part)
     except ValueError:
         step_s = math.nan
-    if not 0.0 < step_s < math.inf:
-        raise InputError(f"{file} has step-length {text!r}; give a number of seconds, such as 0.1")
+    if not 0.001 <= step_s <= 10.0:  # SUMO's shortest
+        raise InputError(f"{file} has step-length {text!r}; give a number of seconds from 0.001 to 10, such as 0.1")
     return step_s
 
 

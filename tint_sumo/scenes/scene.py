@@ -5,6 +5,7 @@ A new scene is a file that makes one, and a line in ``tint_sumo/scenes/__init__.
 
 import hashlib
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, overload
@@ -13,12 +14,14 @@ from tint_sumo.config import (
     Claim,
     EgoController,
     Population,
+    Slots,
+    StepS,
+    TimeS,
     Traffic,
     VehicleShape,
-    require_at_least,
-    require_positive,
 )
-from tint_sumo.errors import InputError, find_named
+from tint_sumo.errors import InputError, find_named, shown
+from tint_sumo.ranges import require_ranges
 from tint_sumo.scenes.digest import scene_digest
 from tint_sumo.scenes.network import Network, Point
 
@@ -73,17 +76,25 @@ class Scene:
     population: Population = field(default_factory=Population)
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     claim: Claim = field(default_factory=Claim)
-    max_vehicles: int = 12  # so many are on the roads, and in an observation, at most (code)
-    step_s: float = 0.1  # code
-    time_limit_s: float = 50.0  # code
+    max_vehicles: Slots = 12  # so many are on the roads, and in an observation, at most (code)
+    step_s: StepS = 0.1  # code; SUMO counts whole milliseconds
+    time_limit_s: TimeS = 50.0  # code
     base: str = ""  # name of the built-in scene that it is with other numbers
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.ego.start_m < self.ego.goal_m:
             start_m, goal_m = self.ego.start_m, self.ego.goal_m
             raise InputError(f"the ego's goal ({goal_m:g} m) must lie beyond its start ({start_m:g} m)")
-        require_at_least(self, 1, "max_vehicles")
-        require_positive(self, "step_s", "time_limit_s")
+        require_ranges(self)
+        require_scene_name(self.name)
+        if abs(self.step_s * 1000 - round(self.step_s * 1000)) > 1e-6:
+            raise InputError(f"step_s must be whole milliseconds, not {self.step_s}")
+        for profile in self.population.profiles:
+            if profile.desired_speed_mps[1] > self.network.speed_limit_mps:
+                raise InputError(
+                    f"desired_speed_mps of {profile.name} must not exceed the roads' limit of "
+                    f"{self.network.speed_limit_mps:g} m/s, {profile.desired_speed_mps[1]:g} m/s does"
+                )
         if not self.step_s <= self.tau_s < math.inf:  # with less, SUMO's drivers hit each other
             raise InputError(f"tau_s must be at least a step of {self.step_s:g} s, and finite, not {self.tau_s}")
 
@@ -96,6 +107,14 @@ class Scene:
     def digest(self) -> str:
         """What tells the roads, the vehicles and the ego's task from others'; drivers and their mix do not count."""
         return scene_digest(self)
+
+
+def require_scene_name(name: str) -> None:
+    """Raise InputError unless a scene can be called so: its name is part of the names of files."""
+    if not re.fullmatch(r"[A-Za-z0-9][\w.-]{0,63}", name):
+        raise InputError(
+            f"name must be of up to 64 letters, digits, '_', '-' and '.', a letter first, not {shown(name)}"
+        )
 
 
 T_INTERSECTION = "t_intersection"  # the paper's scene

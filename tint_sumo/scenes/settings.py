@@ -5,14 +5,27 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from tint_sumo.config import Claim, EgoController, PopulationSetting, VehicleShape
+from tint_sumo.config import (
+    ArrivalsPerS,
+    Claim,
+    DistanceM,
+    EgoController,
+    PopulationSetting,
+    Slots,
+    StepS,
+    TimeS,
+    VehicleShape,
+    WarmUpS,
+)
 from tint_sumo.errors import InputError
+from tint_sumo.ranges import Range, require_ranges
 from tint_sumo.scenes.own import OwnScene, from_sumocfg
-from tint_sumo.scenes.scene import ALL_SCENES, SCENES, T_INTERSECTION, Scene, digest_of, find_scene
+from tint_sumo.scenes.scene import ALL_SCENES, SCENES, T_INTERSECTION, Scene, digest_of, find_scene, require_scene_name
 from tint_sumo.structures import FieldError, Many, Where, build, is_mapping, overlay, plain, require_base, require_known
 
+RouteM = Annotated[float, Range(0.0, 1e6)]
 AnyScene = str | Scene | OwnScene
 
 
@@ -24,9 +37,9 @@ class SceneSettings:
     """The built-in scene whose roads these are."""
     name: str | None
     """What the scene is called if it differs from its base; null: the base's name and a number are joined."""
-    start_m: float
+    start_m: RouteM
     """Where the ego's front starts on its way."""
-    goal_m: float
+    goal_m: RouteM
     """The ego's front past it is a success."""
     controller: EgoController
     """How the ego drives; its desired speeds are the actions."""
@@ -34,18 +47,21 @@ class SceneSettings:
     """When the ego claims a lane, and who reacts to that."""
     population: PopulationSetting
     """Who drives: traits, continuous, a list of profiles, or a mapping of what differs from them."""
-    arrivals_per_s: float | None
+    arrivals_per_s: ArrivalsPerS | None
     """Rate of drivers who come on each route; null: as many as there is room for."""
-    max_vehicles: int
+    max_vehicles: Slots
     """Most vehicles on the roads, and in an observation."""
-    step_s: float
+    step_s: StepS
     """Step of the simulation."""
-    time_limit_s: float
+    time_limit_s: TimeS
     """Longest time of an episode."""
 
     def __post_init__(self) -> None:
         if self.name in SCENES:
             raise InputError(f"name must not be that of a built-in scene, {self.name}; choose another one")
+        if self.name is not None:
+            require_scene_name(self.name)
+        require_ranges(self)
 
     @classmethod
     def of(cls, scene: Scene) -> Self:
@@ -92,17 +108,17 @@ class OwnSceneSettings:
     """SUMO configuration; its step length is the scene's."""
     ego_route: Many[str]
     """Edges that the ego drives along, one after the other."""
-    start_m: float
+    start_m: RouteM
     """Where on its route the ego's front is at the beginning; not on a junction."""
-    goal_m: float
+    goal_m: RouteM
     """The ego's front past it is a success."""
-    max_vehicles: int = OwnScene.max_vehicles
+    max_vehicles: Slots = OwnScene.max_vehicles
     """Most vehicles in an observation, the nearest ones."""
-    sight_m: float = OwnScene.sight_m
+    sight_m: DistanceM = OwnScene.sight_m
     """How far away they may be."""
-    warm_up_s: float = OwnScene.warm_up_s
+    warm_up_s: WarmUpS = OwnScene.warm_up_s
     """For how long the traffic runs before the ego appears."""
-    time_limit_s: float = OwnScene.time_limit_s
+    time_limit_s: TimeS = OwnScene.time_limit_s
     """Longest time of an episode."""
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     """The ego's shape."""

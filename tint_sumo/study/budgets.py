@@ -1,21 +1,24 @@
 """What a study runs: everything that sets its cost and its quality, in one place."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 from tint_sumo.config import (
     P_CONSERVATIVE,
+    Fraction,
+    NoiseM,
     PolicySettings,
     PpoSettings,
+    Seed,
     Share,
+    TauS,
     TraitSettings,
-    require_at_least,
     require_distinct,
-    require_positive,
     require_share,
     set_floats,
 )
 from tint_sumo.errors import InputError
+from tint_sumo.ranges import Range, require_ranges
 from tint_sumo.structures import Many
 
 ALL_MIXES: Share = (0.1, 0.9)  # P(conservative) is drawn from this range in every episode
@@ -27,15 +30,13 @@ class Conditions:
     """The world in which a policy is tested, and after which part of its training."""
 
     p_conservative: Share
-    position_noise_m: float = 0.0
-    tau_s: float | None = None  # time headway of the other drivers; None: the scene's
+    position_noise_m: NoiseM = 0.0
+    tau_s: TauS | None = None  # time headway of the other drivers; None: the scene's
     percent: int = 100  # part of the training after which the policy is tested
 
     def __post_init__(self) -> None:
         require_share(self.p_conservative)
-        require_at_least(self, 0, "position_noise_m")
-        if self.tau_s is not None:
-            require_positive(self, "tau_s")
+        require_ranges(self)
         set_floats(self, "p_conservative", "position_noise_m", "tau_s")
         if self.percent not in (*SNAPSHOTS_PERCENT, 100):
             kept = ", ".join(map(str, (*SNAPSHOTS_PERCENT, 100)))
@@ -76,10 +77,10 @@ class Trials:
     """Some conditions, each with so many cases, which are the same for all policies."""
 
     conditions: Many[Conditions]
-    episodes: int
+    episodes: Annotated[int, Range(1, 1_000_000)]
 
     def __post_init__(self) -> None:
-        require_at_least(self, 1, "episodes")
+        require_ranges(self)
 
     def relative_to(self, scene_tau_s: float) -> "Trials":
         """Return these trials with None for headways that are the scene's."""
@@ -91,12 +92,12 @@ class Budget:
     """Sizes of all stages of a study."""
 
     traits: TraitSettings | None  # settings of the trait models that it learns; None: it takes the shipped ones
-    windows: int = 0  # windows to record for them
-    record_p_conservative: float = 0.5  # share of conservative drivers in the dataset
+    windows: Annotated[int, Range(0, 100_000_000)] = 0  # windows to record for them
+    record_p_conservative: Fraction = 0.5  # share of conservative drivers in the dataset
     ppo: PpoSettings = field(default_factory=PpoSettings)  # settings of PPO, and the steps of every policy
     methods: Many[str] = ("always_go", "ttc", "no_labels", "vae", "oracle")
     mixes: Many[Share] = (ALL_MIXES,)  # P(conservative) in training: a policy for each
-    seeds: Many[int] = (0, 1, 2)
+    seeds: Many[Seed] = (0, 1, 2)
     trials: Many[Trials] = ()
     with_shipped: bool = False  # test the shipped policies, too
 
@@ -104,9 +105,9 @@ class Budget:
         require_distinct(self, "methods", "mixes", "seeds")
         for mix in (self.record_p_conservative, *self.mixes):
             require_share(mix)
-        require_at_least(self, 0, "seeds")
-        if self.traits is not None:
-            require_at_least(self, 1, "windows")
+        require_ranges(self)
+        if self.traits is not None and self.windows == 0:
+            raise InputError("windows must be at least 1, not 0")
 
 
 # A small network is as accurate here as the paper's, trains in minutes and encodes 768 windows in less than 2 ms.

@@ -10,7 +10,7 @@ import pandas as pd
 import torch
 
 from tint_sumo import traits
-from tint_sumo.config import TraitSettings
+from tint_sumo.config import NoiseM, Seed, TrafficSeed, TraitSettings, WindowCount
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, joined, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.executors import Job, Workers, executor_of
@@ -18,6 +18,7 @@ from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import claim_folder, read_json, write_json, write_text
 from tint_sumo.percentages import percent
 from tint_sumo.progress import Report
+from tint_sumo.ranges import require_ranges
 from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.scenes import SCENES, T_INTERSECTION
 from tint_sumo.scenes.geometry import Floats
@@ -39,13 +40,16 @@ _POPULATIONS = ("traits", "continuous")
 class SceneStudy:
     """What is recorded, and which trait models are trained and tested on it."""
 
-    windows: int = 60_000  # windows of each scene and population
+    windows: WindowCount = 60_000  # windows of each scene and population
     methods: Many[str] = ("vae", "cross_window", "morton", "classifier")
     settings: TraitSettings = field(default_factory=lambda: replace(TRAIT_BUDGETS["full"], epochs=10))
-    seeds: Many[int] = (0, 1, 2)
-    noise_m: float = 0.0
+    seeds: Many[Seed] = (0, 1, 2)
+    noise_m: NoiseM = 0.0
     scenes: Many[str] = tuple(SCENES)
-    recording_seed: int = 77  # seed of the first scene; no dataset of a shipped model has it
+    recording_seed: TrafficSeed = 77  # seed of the first scene; no dataset of a shipped model has it
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
 
 
 SCENE_STUDIES = {"full": SceneStudy()}

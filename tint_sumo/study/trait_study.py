@@ -3,17 +3,19 @@
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 
-from tint_sumo.config import TraitSettings
+from tint_sumo.config import Fraction, NoiseM, Seed, TraitSettings, WindowCount
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.executors import Job, Workers, executor_of
 from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import claim_folder, write_json
 from tint_sumo.progress import Report, part_of
+from tint_sumo.ranges import Range, require_ranges
 from tint_sumo.standings import Title
 from tint_sumo.structures import Many
 from tint_sumo.study.budgets import TRAIT_BUDGETS
@@ -25,6 +27,7 @@ from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.storage import RUN_MODEL, add_to_card
 
 DATASET_SEED = 2022
+Latents = Annotated[int, Range(1, 64)]
 PROPERTIES = ("desired_speed_mps", "min_gap_m")
 _DATA, _CONTINUOUS_DATA = "dataset", "continuous"  # folders in a comparison's folder
 
@@ -33,19 +36,22 @@ _DATA, _CONTINUOUS_DATA = "dataset", "continuous"  # folders in a comparison's f
 class TraitStudy:
     """What the comparison runs."""
 
-    windows: int = 696_000  # paper IV-B
+    windows: WindowCount = 696_000  # paper IV-B
     settings: TraitSettings = TRAIT_BUDGETS["full"]
     methods: Many[str] = ("vae", "cross_window", "morton", "classifier")
-    noises_m: Many[float] = (0.0, 0.05, 0.1, 0.2)
-    seeds: Many[int] = (0, 1, 2)
-    p_conservative: float = 0.5  # mix of the training data
-    other_p: Many[float] = (0.25, 0.4, 0.6)  # mixes of further test data
-    other_windows: int = 30_000
-    continuous_windows: int = 240_000
+    noises_m: Many[NoiseM] = (0.0, 0.05, 0.1, 0.2)
+    seeds: Many[Seed] = (0, 1, 2)
+    p_conservative: Fraction = 0.5  # mix of the training data
+    other_p: Many[Fraction] = (0.25, 0.4, 0.6)  # mixes of further test data
+    other_windows: WindowCount = 30_000
+    continuous_windows: WindowCount = 240_000
     continuous_methods: Many[str] = ("vae", "cross_window")
-    continuous_latents: Many[int] = (2, 4)
-    continuous_seeds: Many[int] = (0, 1)
-    continuous_epochs: int = 10  # properties without classes take longer to show
+    continuous_latents: Many[Latents] = (2, 4)
+    continuous_seeds: Many[Seed] = (0, 1)
+    continuous_epochs: Annotated[int, Range(1, 1_000_000)] = 10  # properties without classes take longer to show
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
 
 
 TRAIT_STUDIES = {"full": TraitStudy()}

@@ -302,7 +302,10 @@ def test_study_report_names_its_files_as_the_user_does(
         ("traits infer --fcd DATA --model MODEL --net NOWHERE --out OUT.csv", "knows its leaders"),
         ("traits infer --fcd MODEL --model MODEL --net NOWHERE --out OUT.csv", "SUMO network: no file"),
         ("traits infer --fcd MODEL --model MODEL --out OUT.csv", "is not whole XML"),
-        ("traits infer --fcd DATA --model MODEL --vehicle-length 0 --out OUT.csv", "vehicle_length must lie in 0.5 to 30, not 0.0"),
+        (
+            "traits infer --fcd DATA --model MODEL --vehicle-length 0 --out OUT.csv",
+            "vehicle_length must lie in 0.5",
+        ),
         ("policy train --method magic --out OUT", "unknown method 'magic'"),
         ("policy train --method ttc --out OUT", "hand-written rule"),
         ("policy train --method ours --out OUT", "ours is now called vae"),

@@ -133,7 +133,7 @@ def test_a_length_counts_the_items() -> None:
         ({"step_s": 1e-4}, "step_s: must lie in 0.01 to 1, not 0.0001"),
         ({"step_s": 0.0123}, "step_s must be whole milliseconds, not 0.0123"),
         ({"max_vehicles": 10**9}, "max_vehicles: must lie in 1 to 200, not 1000000000"),
-        ({"name": "../../x"}, "name must be up to 64 letters, digits"),
+        ({"name": "../../x"}, "name must be of up to 64 letters, digits"),
         ({"controller": {"desired_speeds_mps": [0, 0, 0]}}, "desired_speeds_mps must rise from the slowest"),
         ({"controller": {"desired_speeds_mps": [3, 2, 1]}}, "desired_speeds_mps must rise from the slowest"),
         ({"controller": {"desired_speeds_mps": [3]}}, "desired_speeds_mps: must have 2 to 100 values, not 1"),

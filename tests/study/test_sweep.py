@@ -23,6 +23,7 @@ from tint_sumo.study.sweep import Sweep, VariantJob, plan, read_varied, report_m
 
 COLUMNS = ["variant", "method", "seed", "p_conservative", "success", "timeout", "collision", "navigation_time_s"]
 VARIANTS = ["learning_rate=0.001", "learning_rate=0.003"]
+LONG = f"[{','.join(['1024'] * 8)}]"
 
 
 @pytest.fixture(scope="module")
@@ -167,6 +168,7 @@ def test_words_say_values_as_files_do() -> None:
         ("n_envs=2,4 n_minibatches=1,4", "n_minibatches must be at most n_envs (2)"),
         ("learning_rate=0.001,1e-3", "learning_rate must have each value once, not 0.001, 0.001"),
         (f"policy.head_sizes=[{','.join(['1'] * 9)}]", "policy.head_sizes: must have 0 to 8 values, not 9"),
+        (f"policy.head_sizes={LONG} policy.joint_sizes={LONG} policy.score_sizes={LONG}", "more than 150; vary fewer"),
         ("n_epochs=2 --methods ttc", "is a hand-written rule"),
         ("n_epochs=2 --methods oracle oracle", "methods must be one or more, each of them once"),
         ("n_epochs=2 --methods vae ma --scene on_ramp", "vae, ma: the shipped trait models know the scene"),

@@ -182,7 +182,7 @@ def test_there_is_nothing_to_come_back_to_before_the_first_reset() -> None:
     with made() as env, pytest.raises(InputError, match="reset the environment first"):
         env.snapshot()
     with closing(SceneVectorEnv(2)) as vector:
-        with pytest.raises(InputError, match="reset the environments first"):
+        with pytest.raises(InputError, match="reset the environment first"):
             vector.snapshot()
         vector.reset(seed=0)
         with pytest.raises(InputError, match="1 snapshots do not fit 2 environments"):

@@ -128,14 +128,6 @@ def test_without_autoreset_ended_episodes_take_no_step() -> None:
         env.step(np.array([GO, GO]))
 
 
-@pytest.mark.parametrize("mask", [[True], [1, 0], [False, False], [[True, False]], "yes"])
-def test_a_reset_mask_has_a_boolean_for_each_environment(mask: Any) -> None:
-    with closing(SceneVectorEnv(2)) as env:
-        env.reset(seed=0)
-        with pytest.raises(InputError, match="reset_mask must be 2 booleans, one for each environment"):
-            env.reset(options={"reset_mask": np.array(mask)})
-
-
 def test_an_unknown_mode_is_refused() -> None:
     with pytest.raises(InputError, match="unknown autoreset_mode 'never'; choose one of 'NextStep', 'SameStep', 'Dis"):
         SceneVectorEnv(2, autoreset_mode="never")

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +126,7 @@ def test_closing_ends_the_workers(vector: SceneVectorEnv) -> None:
     vector.close()
     vector.close()
     assert not any(map(is_alive, ids))
-    with pytest.raises(RuntimeError, match="closed; make a new one"):
+    with pytest.raises(InputError, match="closed; make a new one"):
         vector.step(np.zeros(3, np.int64))
 
 
@@ -133,24 +134,28 @@ def test_a_killed_worker_is_reported_and_ends_the_others(vector: SceneVectorEnv)
     vector.reset(seed=0)
     ids = worker_ids()
     os.kill(ids[0], signal.SIGKILL)
-    with pytest.raises(RuntimeError, match="died with exit code -9; make a new environment"):
+    with pytest.raises(RuntimeError, match="died with exit code -9; reset all environments"):
         for _ in range(3):
             vector.step(np.zeros(3, np.int64))
     assert not any(map(is_alive, ids))
 
 
-def test_an_error_in_a_worker_reaches_the_caller(vector: SceneVectorEnv) -> None:
-    with pytest.raises(RuntimeError, match=r"worker 2 failed:\n(?s:.*)Seed must be"):
-        vector.reset(seed=[1, 2, -3])
+@pytest.mark.parametrize("broken", [0, 2])  # in this process, and in another one
+def test_an_error_reaches_the_caller_and_ends_all_workers_until_the_next_reset(
+    broken: int, vector: SceneVectorEnv
+) -> None:
+    first = vector.reset(seed=0)[0]
+    snapshots = vector.snapshot()
+    snapshots[broken] = replace(snapshots[broken], began={})
+    with pytest.raises(ValueError if broken == 0 else RuntimeError, match="state must be for a PCG64"):
+        vector.restore(snapshots)
     assert not worker_ids()
-
-
-def test_an_error_in_this_process_ends_the_workers(vector: SceneVectorEnv) -> None:
-    with pytest.raises(gymnasium.error.Error, match="Seed must be"):
-        vector.reset(seed=[-1, 2, 3])
-    assert not worker_ids()
-    with pytest.raises(RuntimeError, match="closed; make a new one"):
-        vector.reset()
+    with pytest.raises(InputError, match="an earlier call has failed or was interrupted; reset the environment first"):
+        vector.step(np.zeros(3, np.int64))
+    with pytest.raises(InputError, match="reset the environment first"):
+        vector.reset(options={"reset_mask": np.array([True, False, False])})
+    assert_equal(vector.reset(seed=0)[0], first)
+    assert len(worker_ids()) == 2
 
 
 def test_this_process_takes_part_unless_its_libsumo_is_taken() -> None:
@@ -168,14 +173,6 @@ def test_this_process_takes_part_unless_its_libsumo_is_taken() -> None:
         assert infos["time_s"].tolist() == [0.1, 0.1]
     finally:
         first.close()
-
-
-def test_bad_actions_are_refused_before_any_worker_steps(vector: SceneVectorEnv) -> None:
-    vector.reset(seed=0)
-    with pytest.raises(InputError, match="actions must be 3 of 0, 1, 2"):
-        vector.step(np.array([0, 1, 3]))
-    *_, infos = vector.step(np.array([0, 1, 2]))
-    assert infos["time_s"].tolist() == [0.1] * 3
 
 
 @pytest.mark.parametrize("workers", [0, 3])

@@ -146,12 +146,6 @@ def observation_space(max_vehicles: int) -> spaces.Dict:
     )
 
 
-def require_actions(actions: NDArray[np.integer], num_envs: int, choices: int) -> None:
-    if actions.shape != (num_envs,) or not ((actions >= 0) & (actions < choices)).all():
-        allowed = ", ".join(map(str, range(choices)))
-        raise InputError(f"actions must be {num_envs} of {allowed}, not {actions.tolist()}")
-
-
 def episode_seed(rng: np.random.Generator) -> int:
     """Seed of the next episode of an environment with this generator."""
     return int(rng.integers(_SEED_LIMIT))
@@ -195,6 +189,9 @@ class Episodes:
         """Empty an environment, whose ego stands and whose time does not pass until its next episode begins."""
         self.simulation.clear(index)
         self._parked.add(index)
+        self.rows[index] = np.zeros((), self.rows.dtype)
+        self.steps[index] = 0
+        self._observe(slice(index, index + 1))
 
     @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> bool:

@@ -110,7 +110,7 @@ class SceneVecEnv(VecEnv):
         if method_name != "park":
             raise NotImplementedError("the environments share one simulation and have no methods of their own but park")
         parked = list(self._get_indices(indices))
-        self.env.batch.park(np.isin(np.arange(self.num_envs), parked))
+        self.env.park(np.isin(np.arange(self.num_envs), parked))
         return [None for _ in parked]
 
     def env_is_wrapped(

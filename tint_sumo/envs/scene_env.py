@@ -1,6 +1,8 @@
 """The single environment."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import gymnasium
@@ -9,18 +11,11 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Snapshot
-from tint_sumo.envs.episodes import (
-    Episodes,
-    TaskSettings,
-    action_space,
-    observation_space,
-    require_actions,
-    require_arguments,
-)
+from tint_sumo.envs.calls import Phase, checked_actions, checked_seed, require_episode, require_open
+from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_arguments
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, require_render_mode
 from tint_sumo.envs.rows import Observation, fields_of, observation_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
-from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
 from tint_sumo.simulation.own import OwnSimulation
 from tint_sumo.simulation.simulation import Simulation
@@ -114,6 +109,11 @@ class SceneEnv(gymnasium.Env[Any, Any]):
       display and a Python with tkinter; if you close it, the episodes go on without it. The wrapper
       `gymnasium.wrappers.RecordVideo` takes `"rgb_array"`, and moviepy: `pip install "tint_sumo[video]"`.
 
+    ## Copies
+    `copy.deepcopy(env)` is an independent environment in the same state, as planners need it, and a pickle can be
+    loaded in another process. The episode so far is simulated once more for that. As long as the original uses libsumo,
+    copies in its process go through TraCI. A copy has no window.
+
     ## Version History
     TIntersection:
     * v1: a conservative driver that can no longer stop clear of the ego's way drives on. Before, it braked and stood so
@@ -140,6 +140,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self.observation_space = observation_space(settings.played.max_vehicles)
         self.action_space: gymnasium.spaces.Discrete = action_space(settings.played)
         self._slot_infos = settings.slot_infos
+        self._settings = settings
+        self._phase = Phase.NEW
         self._episodes = Episodes(1, settings)
         self._began: dict[str, Any] = {}
         self._actions: list[int] = []
@@ -160,26 +162,48 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         seed: int | None = None,
         options: dict[str, Any] | None = None,  # noqa: ARG002 - gymnasium's signature; there are none
     ) -> tuple[Observation, dict[str, Any]]:
-        super().reset(seed=seed)
-        self._begin()
+        require_open(self._phase)
+        super().reset(seed=checked_seed(seed))
+        self._play(())
         self._show()
         return self._shown()
 
-    def _begin(self) -> None:
+    @cached_property
+    def _episodes(self) -> Episodes:
+        """The running simulation; started when it is needed in a copy, or after a call that was interrupted."""
+        require_open(self._phase)
+        return Episodes(1, self._settings)
+
+    def _stop(self) -> None:
+        """End the simulation, if one runs."""
+        if "_episodes" in vars(self):
+            self._episodes.simulation.close()
+            del self._episodes
+
+    def _play(self, actions: Sequence[int]) -> None:
+        """Begin an episode drawn from the generator, and take these actions in it."""
+        if self._phase is Phase.BUSY:  # nobody knows how much of an interrupted call was done
+            self._stop()
+        self._phase = Phase.BUSY
         self._began = dict(self.np_random.bit_generator.state)
         self._actions = []
         self._episodes.begin(0, self.np_random)
+        for action in actions:
+            self._step(np.array([action]))
+        self._phase = Phase.READY
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        actions = np.array([action])
-        require_actions(actions, 1, int(self.action_space.n))
+        require_episode(self._phase)
+        actions = checked_actions(action, (), int(self.action_space.n)).reshape(1)
+        self._phase = Phase.BUSY
         self._step(actions)
+        self._phase = Phase.READY
         self._show()
         fields = fields_of(self._episodes.rows[0])
         info = step_info(fields, self._slot_infos, self._episodes.collision_info(0))
         return _observation(fields), fields["reward"], fields["terminated"], fields["truncated"], info
 
-    def _step(self, actions: NDArray[np.int64]) -> None:
+    def _step(self, actions: NDArray[np.integer]) -> None:
         self._actions.append(int(actions[0]))
         self._episodes.step(actions)
 
@@ -194,8 +218,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         Raises:
             InputError: no episode has begun.
         """
-        if not self._began:
-            raise InputError("there is no episode to come back to; reset the environment first")
+        require_episode(self._phase)
         return Snapshot(self._began, tuple(self._actions))
 
     def restore(self, snapshot: Snapshot) -> tuple[Observation, dict[str, Any]]:
@@ -204,10 +227,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         The episode is simulated once more up to there, which takes as long as it took: SUMO's own saved states do not
         hold all that its vehicles remember, and would not go on to the last bit as the episode did.
         """
+        require_open(self._phase)
         self.np_random.bit_generator.state = snapshot.began
-        self._begin()
-        for action in snapshot.actions:
-            self._step(np.array([action]))
+        self._play(snapshot.actions)
         self._show()
         return self._shown()
 
@@ -221,6 +243,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
         None with ``render_mode="human"``, where the window follows by itself.
         """
+        require_episode(self._phase)
         return render_scene(self._episodes.simulation, 0) if self.render_mode == "rgb_array" else None
 
     def _show(self) -> None:
@@ -228,9 +251,31 @@ class SceneEnv(gymnasium.Env[Any, Any]):
             self._window.show(render_scene(self._episodes.simulation, 0))
 
     def close(self) -> None:
+        """End the simulation; safe to call twice. Everything else is refused from then on."""
+        self._phase = Phase.CLOSED
         if self._window:
             self._window.close()
-        self._episodes.simulation.close()
+        self._stop()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle consists of: everything but the window and the simulation."""
+        return {name: value for name, value in vars(self).items() if name not in ("_window", "_episodes")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become the copy that ``state`` tells of, in a simulation of its own.
+
+        Libsumo may be in use by the original; then the copy goes through TraCI.
+        """
+        vars(self).update(state)
+        self._window = None
+        if self.render_mode == "human":
+            self.render_mode = None
+        if self._settings.backend == "libsumo":
+            self._settings = replace(self._settings, backend="auto")
+        if self._phase is Phase.READY:
+            drawn = self.np_random.bit_generator.state
+            self.restore(self.snapshot())
+            self.np_random.bit_generator.state = drawn  # also what the user has drawn from it since the reset
 
 
 def _observation(fields: dict[str, Any]) -> Observation:

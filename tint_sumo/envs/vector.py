@@ -1,6 +1,8 @@
 """The vector environment: all environments are replicas of a scene in one simulation."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,13 +12,15 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Batch, Ended, LocalBatch, Snapshot
-from tint_sumo.envs.episodes import (
-    TaskSettings,
-    action_space,
-    observation_space,
-    require_actions,
-    require_arguments,
+from tint_sumo.envs.calls import (
+    Phase,
+    checked_actions,
+    checked_mask,
+    checked_seeds,
+    require_episode,
+    require_open,
 )
+from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space, require_arguments
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
 from tint_sumo.envs.rows import (
     GOING_ON,
@@ -97,45 +101,53 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self.single_action_space: spaces.Discrete = action_space(settings.played)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.batch: Batch = (
-            LocalBatch(num_envs, settings, self._mode)
-            if len(scenes) == 1
-            else WorkerBatch(num_envs, all_settings, self._mode)
-        )
-        self._has_begun = False
+        self._settings = all_settings
+        self._phase = Phase.NEW
+        self.batch = self._make_batch()
+
+    def _make_batch(self) -> Batch:
+        settings = self._settings
+        if len(settings) == 1:
+            return LocalBatch(self.num_envs, settings[0], self._mode)
+        return WorkerBatch(self.num_envs, settings, self._mode)
+
+    @cached_property
+    def batch(self) -> Batch:
+        """The running environments; started when they are needed in a copy, or after a call that was interrupted."""
+        require_open(self._phase)
+        return self._make_batch()
+
+    def _stop(self) -> None:
+        """End the simulations, if any run."""
+        if "batch" in vars(self):
+            self.batch.close()
+            del self.batch
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start a new episode in every environment, or in those of ``options["reset_mask"]``."""
-        if seed is None:
-            seeds: Sequence[int | None] = [None] * self.num_envs
-        elif isinstance(seed, int | np.integer):
-            seeds = [int(seed) + index for index in range(self.num_envs)]
-        else:
-            seeds = seed
-        if len(seeds) != self.num_envs:
-            raise InputError(f"{len(seeds)} seeds do not fit {self.num_envs} environments; give one number or as many")
-        mask = self._reset_mask(options or {})
-        self.batch.reset(seeds, mask)
-        self._has_begun = True
-        return self._shown(mask)
+        """Start a new episode in every environment, or in those of ``options["reset_mask"]``.
 
-    def _reset_mask(self, options: dict[str, Any]) -> NDArray[np.bool_]:
-        """The environments (N,) to reset."""
-        if "reset_mask" not in options:
-            return np.ones(self.num_envs, bool)
-        mask = np.asarray(options["reset_mask"])
-        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-            raise InputError(
-                f"reset_mask must be {self.num_envs} booleans, one for each environment, at least one of them true; "
-                f"not {options['reset_mask']!r}"
-            )
-        return mask
+        Raises:
+            InputError: a seed or the mask does not fit; or the mask leaves out environments that have no episode yet,
+                or whose last call has failed or was interrupted.
+        """
+        require_open(self._phase)
+        seeds = checked_seeds(seed, self.num_envs)
+        mask = checked_mask((options or {}).get("reset_mask"), self.num_envs)
+        if not mask.all():
+            require_episode(self._phase)
+        if self._phase is Phase.BUSY:  # nobody knows how much of an interrupted call was done
+            self._stop()
+        self._phase = Phase.BUSY
+        self.batch.reset(seeds, mask)
+        self._phase = Phase.READY
+        return self._shown(mask)
 
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        require_episode(self._phase)
         begun = self.batch.rows["outcome"] != GOING_ON  # those that ended before: NEXT_STEP now begins the next ones
         if self._mode is AutoresetMode.DISABLED and begun.any():
             raise InputError(
@@ -157,9 +169,11 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
         Rewards, terminations and truncations are those of the step, all else is as it is now.
         """
-        actions = np.asarray(actions)
-        require_actions(actions, self.num_envs, int(self.single_action_space.n))
-        ended = self.batch.step(actions)
+        require_episode(self._phase)
+        taken = checked_actions(actions, (self.num_envs,), int(self.single_action_space.n))
+        self._phase = Phase.BUSY
+        ended = self.batch.step(taken)
+        self._phase = Phase.READY
         rows = copied(self.batch.rows)
         for one in ended:
             for key in ("reward", "terminated", "truncated"):
@@ -172,9 +186,11 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         Raises:
             InputError: no episodes have begun.
         """
-        if not self._has_begun:
-            raise InputError("there are no episodes to come back to; reset the environments first")
-        return self.batch.snapshot()
+        require_episode(self._phase)
+        self._phase = Phase.BUSY
+        snapshots = self.batch.snapshot()
+        self._phase = Phase.READY
+        return snapshots
 
     def restore(self, snapshots: Sequence[Snapshot]) -> tuple[Observation, dict[str, Any]]:
         """Go back, or to the episodes of another vector with the same arguments; the observation and infos there.
@@ -184,11 +200,22 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         Raises:
             InputError: there are not as many snapshots as environments.
         """
+        require_open(self._phase)
         if len(snapshots) != self.num_envs:
             raise InputError(f"{len(snapshots)} snapshots do not fit {self.num_envs} environments; give as many")
+        if self._phase is Phase.BUSY:
+            self._stop()
+        self._phase = Phase.BUSY
         self.batch.restore(snapshots)
-        self._has_begun = True
+        self._phase = Phase.READY
         return self._shown()
+
+    def park(self, mask: NDArray[np.bool_]) -> None:
+        """Empty the environments where the mask (N,) is true: they cost next to nothing until their next reset."""
+        require_episode(self._phase)
+        self._phase = Phase.BUSY
+        self.batch.park(mask)
+        self._phase = Phase.READY
 
     def _shown(self, mask: NDArray[np.bool_] | None = None) -> tuple[Observation, dict[str, Any]]:
         """The observation where the environments are, and the infos of those in the mask, by default of all."""
@@ -214,10 +241,30 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One (H, W, 3) image per environment."""
-        return None if self.render_mode is None else tuple(self.batch.render())
+        require_episode(self._phase)
+        if self.render_mode is None:
+            return None
+        self._phase = Phase.BUSY
+        images = tuple(self.batch.render())
+        self._phase = Phase.READY
+        return images
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002 - gymnasium's signature
-        self.batch.close()
+        self._phase = Phase.CLOSED
+        self._stop()
+
+    def __getstate__(self) -> tuple[dict[str, Any], list[Snapshot]]:
+        """Return what a copy or a pickle consists of: everything but the simulations, and where the episodes are."""
+        attributes = {name: value for name, value in vars(self).items() if name != "batch"}
+        return attributes, self.snapshot() if self._phase is Phase.READY else []
+
+    def __setstate__(self, state: tuple[dict[str, Any], list[Snapshot]]) -> None:
+        """Become the copy that ``state`` tells of, as in ``SceneEnv``."""
+        attributes, snapshots = state
+        vars(self).update(attributes)
+        self._settings = [replace(one, backend="auto") if one.backend == "libsumo" else one for one in self._settings]
+        if snapshots:
+            self.restore(snapshots)
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

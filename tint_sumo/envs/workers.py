@@ -48,7 +48,7 @@ class WorkerBatch:
         self.rows = shared.rows
         self._local: LocalBatch | None = None
         self._helpers: list[_Helper] = []
-        self._finalizer = weakref.finalize(self, _end, self._helpers)
+        weakref.finalize(self, _end, self._helpers)
         takes_part = settings[0].backend == "traci" or libsumo_is_free()
         try:
             for worker in range(int(takes_part), workers):
@@ -86,12 +86,10 @@ class WorkerBatch:
     def close(self) -> None:
         if self._local is not None:
             self._local.close()
-        self._finalizer()
+        _end(self._helpers)
 
     def _ask(self, request: str, arguments: Callable[[slice], tuple[Any, ...]]) -> list[Any]:
         """Call a method of every process's batch, with arguments for its share; their answers."""
-        if not self._finalizer.alive:
-            raise RuntimeError("the environment is closed; make a new one")
         try:
             for helper in self._helpers:
                 with suppress(ConnectionError):  # a worker that has died is noticed at the next answer
@@ -121,7 +119,8 @@ class _Helper:
         except (EOFError, ConnectionError):
             self.process.join(_ENDING_S)
             raise RuntimeError(
-                f"environment worker {self.worker} died with exit code {self.process.exitcode}; make a new environment"
+                f"environment worker {self.worker} died with exit code {self.process.exitcode}; "
+                "reset all environments to start it anew"
             ) from None
         return answer(message, f"environment worker {self.worker}")
 
@@ -134,6 +133,7 @@ def _start(
 
 
 def _end(helpers: list[_Helper]) -> None:
+    """End processes; safe to call twice, also if the first call was interrupted."""
     for helper in helpers:
         helper.line.close()  # it ends when the other end is closed
     for helper in helpers:

@@ -1,0 +1,118 @@
+"""What callers may ask of an environment, and when: checked before anything is done."""
+
+import operator
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tint_sumo.errors import InputError
+
+_SHOWN = 80  # characters of a value that is refused
+
+
+class Phase(Enum):
+    """Where an environment is between its making and its end; the value says why it cannot step."""
+
+    NEW = "no episode has begun; reset the environment first"
+    READY = ""
+    BUSY = "an earlier call has failed or was interrupted; reset the environment first"  # seen between calls
+    CLOSED = "the environment is closed; make a new one"
+
+
+def require_open(phase: Phase) -> None:
+    """Raise InputError after ``close()``."""
+    if phase is Phase.CLOSED:
+        raise InputError(phase.value)
+
+
+def require_episode(phase: Phase) -> None:
+    """Raise InputError where there is no episode to go on with."""
+    if phase is not Phase.READY:
+        raise InputError(phase.value)
+
+
+def checked_actions(actions: Any, shape: tuple[int, ...], choices: int) -> NDArray[np.integer]:
+    """Return actions as an array of this shape, () for one environment or (N,).
+
+    Integers of any width are taken, also those of numpy and torch.
+
+    Raises:
+        InputError: they are no such integers, out of range, or as many as there are not.
+    """
+    array = _as_array(actions)
+    if (
+        array.dtype.kind not in "iu"
+        or array.shape != shape
+        or not ((array >= 0) & (array < choices)).all()
+        or (isinstance(actions, list | tuple) and any(isinstance(one, bool | np.bool_) for one in actions))
+    ):
+        allowed = ", ".join(map(str, range(choices)))
+        wanted = f"actions must be {shape[0]} of {allowed}" if shape else f"an action must be one of {allowed}"
+        raise InputError(f"{wanted}, not {_shown(actions)}")
+    return array
+
+
+def checked_seed(seed: Any) -> int | None:
+    """Return a seed as Python's integer; integers of numpy and torch are taken, too.
+
+    Raises:
+        InputError: it is no integer of at least 0, nor None.
+    """
+    if seed is None:
+        return None
+    try:
+        number = -1 if _as_array(seed).dtype.kind == "b" else operator.index(seed)
+    except TypeError:
+        number = -1
+    if number < 0:
+        raise InputError(f"a seed must be an integer of at least 0, not {_shown(seed)}")
+    return number
+
+
+def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
+    """Return a seed for each environment: one number stands for itself and those that follow.
+
+    Raises:
+        InputError: there are not as many as environments, or one is no seed.
+    """
+    try:
+        seeds = [checked_seed(one) for one in seed]
+    except TypeError:  # not iterable
+        first = checked_seed(seed)
+        return [None if first is None else first + index for index in range(num_envs)]
+    if len(seeds) != num_envs:
+        raise InputError(f"{len(seeds)} seeds do not fit {num_envs} environments; give one number or as many")
+    return seeds
+
+
+def checked_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:
+    """Return which environments to reset, (N,); all where the mask is None.
+
+    Raises:
+        InputError: it is not one boolean per environment, or none of them is true.
+    """
+    if mask is None:
+        return np.ones(num_envs, bool)
+    array = _as_array(mask)
+    if array.dtype.kind != "b" or array.shape != (num_envs,) or not array.any():
+        raise InputError(
+            f"reset_mask must be {num_envs} booleans, one for each environment, at least one of them true; "
+            f"not {_shown(mask)}"
+        )
+    return array
+
+
+def _as_array(value: Any) -> NDArray[Any]:
+    """Return what numpy makes of a value; an object where it can make nothing of it."""
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError, RuntimeError):
+        return np.array(None)
+
+
+def _shown(value: Any) -> str:
+    """Return a value for a message: in one line, and not all of it if it is long."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."

@@ -5,6 +5,7 @@ import gzip
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,9 @@ from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import METHODS
 from tint_sumo.study.page import write_page
 from tint_sumo.study.page.charts import curve_chart, outcome_chart, world_charts
-from tint_sumo.study.page.choosing import MOST_CASES, choose, choose_cases
+from tint_sumo.study.page.choosing import MOST_CASES, Choice, Shown, choose, choose_cases
+from tint_sumo.study.page.episodes import Recorded, Recordings, failure_lists
+from tint_sumo.study.page.findings import what_came_out
 from tint_sumo.study.page.html import json_data, packed, table
 from tint_sumo.study.page.recording import MISSING, UNITS, Recording, RecordJob, encode, read_episodes
 from tint_sumo.study.page.roads import scene_shapes
@@ -280,6 +283,60 @@ def test_sections_without_data_say_why_they_are_left_out(bare: str) -> None:
     assert "no policy" in section(bare, "player")
     assert "90.0" in section(bare, "results")
     assert not re.search(r'id="(episode-|player-data|latent-data)', bare)
+
+
+def test_the_page_says_first_what_came_out_and_what_p_is(bare: str) -> None:
+    header = bare[bare.index("<header>") : bare.index("</header>")]
+    first, second, _ = re.findall("<p>(.*?)</p>", header)
+    assert first == "At P 0.4 all 2 methods succeeded in 90.0 % of the cases."
+    assert second.startswith("P is P(conservative): the probability that a driver is conservative, and yields")
+
+
+@pytest.mark.parametrize(
+    ("results", "words"),
+    [
+        ({"ttc": {0.4: (3, 1, 0)}}, "At P 0.4 the method time to collision succeeded in 75.0 % of the cases."),
+        (
+            {"ttc": {0.25: (0, 4, 0), 0.4: (1, 3, 0)}, "oracle": {0.25: (4, 0, 0), 0.4: (3, 1, 0), 0.6: (0, 4, 0)}},
+            "At P 0.25 and 0.4 the method oracle succeeded most often, in 87.5 % of the cases, and time to collision "
+            "least often, in 12.5 %.",
+        ),
+        (
+            {"no_labels": {0.4: (2, 2, 0)}, "vae": {0.4: (3, 1, 0)}, "morton": {0.4: (1, 3, 0)}},
+            "At P 0.4 the method paper's method succeeded most often, in 75.0 % of the cases, and Morton least often, "
+            "in 25.0 %. The best method that infers traits, paper's method, reached 75.0 %; no labels, which infers "
+            "none, reached 50.0 %.",
+        ),
+        ({"ttc": {(0.1, 0.9): (1, 0, 0)}}, "At P 0.1 to 0.9 the method time to collision succeeded in 100.0 % of the"),
+        ({"ttc": {0.4: (1, 0, 0)}, "oracle": {0.6: (1, 0, 0)}}, ""),
+    ],
+)
+def test_what_came_out_is_told_of_the_mixes_that_all_methods_met(results: dict[str, Any], words: str) -> None:
+    rows = tabulate(
+        [
+            (given if name == "ttc" else partial(trained, seed=0))(
+                name, tested={Conditions(p): counts for p, counts in fared.items()}
+            )
+            for name, fared in results.items()
+        ]
+    )
+    assert what_came_out(rows).startswith(words) and bool(words) == bool(what_came_out(rows))
+
+
+def test_failures_are_listed_folded_and_only_where_there_are_any() -> None:
+    def recorded(method: str, fared: Evaluation, outcome: str) -> Recorded:
+        return Recorded(Shown(method, "ttc", None, 0, fared), {0: {"outcome": outcome, "time_s": 10.0}})
+
+    good = recorded("good", outcomes("ss"), "success")
+    bad = recorded("bad", outcomes("cs"), "collision")
+    unlucky = recorded("unlucky", outcomes("sc"), "success")  # its failure is none of the recorded cases
+    lists = failure_lists(Recordings("t_intersection", Choice(Conditions(0.4), (), (0,)), (good, bad, unlucky), ()))
+    assert "good" not in lists
+    assert re.findall("<details><summary>(.*?)</summary>", lists) == [
+        "bad: 1 collision and 0 timeouts in 2 cases; 1 of them recorded"
+    ]
+    assert "<p>unlucky: 1 collision and 0 timeouts in 2 cases; 0 of them recorded</p>" in lists
+    assert failure_lists(Recordings("t_intersection", Choice(Conditions(0.4), (), (0,)), (good,), ())) == ""
 
 
 def test_the_page_leads_nowhere_else_and_is_small(bare: str) -> None:

@@ -16,7 +16,7 @@ from tint_sumo.study.page.recording import UNITS, read_episodes
 sync_api = pytest.importorskip("playwright.sync_api", reason='no browser tests without: pip install "tint_sumo[dev]"')
 axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason='needs: pip install "tint_sumo[dev]"')
 
-DESK, PHONE = {"width": 1280, "height": 900}, {"width": 390, "height": 844}
+DESK, PHONE = {"width": 1280, "height": 900}, {"width": 360, "height": 740}
 GRAVE = ("serious", "critical")
 # The name and the outline of what has the focus; nothing when it has left the page.
 _FOCUSED = """(() => {
@@ -113,6 +113,11 @@ def test_the_page_keeps_nobody_out(browser: Any, study: Path, viewport: dict[str
     for fold in page.locator("summary:visible").all():
         fold.click()
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    if viewport == PHONE:
+        boxes = page.locator(".scrolls:visible")
+        wide = "one => one.scrollWidth > one.clientWidth ? [one.getAttribute('aria-label')] : []"
+        assert boxes.count() > 5 and page.evaluate(f"[...document.querySelectorAll('.scrolls')].flatMap({wide})") == []
+        assert "method" not in page.locator("#results tbody tr").first.inner_text()
     found = axe.Axe().run(page).response["violations"]
     assert [(one["id"], [node["target"] for node in one["nodes"]][:3]) for one in found if one["impact"] in GRAVE] == []
     assert opened.troubles == []
@@ -221,6 +226,7 @@ def test_it_plays_only_when_told_and_at_the_chosen_speed(browser: Any, study: Pa
 @pytest.mark.parametrize("how", ["click", "tap", "Enter"])
 def test_failures_open_in_the_player(browser: Any, study: Path, how: str) -> None:
     opened = Opened(browser, study / "report.html", has_touch=True)
+    opened.page.locator("#failures summary").first.click()
     button = opened.page.locator("#failures button", has_text="Case 2").first
     words = str(button.text_content())
     {"click": button.click, "tap": button.tap, "Enter": lambda: button.press("Enter")}[how]()
@@ -242,6 +248,7 @@ def test_the_list_tells_how_often_all_failed_and_what_was_recorded_otherwise(ope
 
 def test_the_keyboard_alone_reaches_every_control_and_shows_where_it_is(opened: Opened) -> None:
     page, seen = opened.page, []
+    page.evaluate("document.querySelectorAll('#failures details').forEach(one => one.open = true)")
     page.keyboard.press("Tab")
     while (at := page.evaluate(_FOCUSED)) is not None:
         name, outline = at

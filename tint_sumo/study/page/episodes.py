@@ -12,9 +12,9 @@ from tint_sumo.errors import InputError
 from tint_sumo.executors import Workers
 from tint_sumo.scenes import Scene
 from tint_sumo.study.evaluation import Case
-from tint_sumo.study.methods import METHODS
+from tint_sumo.study.methods import METHODS, look_of
 from tint_sumo.study.page.choosing import FAILURES, Choice, Shown
-from tint_sumo.study.page.html import bullets, json_data, packed, paragraph
+from tint_sumo.study.page.html import bullets, folded, json_data, packed, paragraph
 from tint_sumo.study.page.recording import MISSING, UNITS, Recording, read_episodes, record_all
 from tint_sumo.study.page.roads import scene_shapes
 
@@ -69,6 +69,7 @@ def player_data(recordings: Recordings) -> str:
             {
                 "label": one.policy.label,
                 "title": one.policy.title,
+                "colour": look_of(one.policy.method).colour,
                 "outcomes": {str(case): episode["outcome"] for case, episode in one.episodes.items()},
             }
             for one in recordings.policies
@@ -109,7 +110,7 @@ def player_notes(recordings: Recordings) -> str:
 
 
 def failure_lists(recordings: Recordings) -> str:
-    """Of each policy: how often it failed, and its recorded failures as buttons that open the player."""
+    """Of each policy that failed: how often, and folded its recorded failures as buttons that open the player."""
     return "".join(_failures(one) for one in recordings.policies)
 
 
@@ -117,14 +118,16 @@ def _failures(one: Recorded) -> str:
     cases = one.policy.evaluation.cases
     counts = {outcome: sum(case.outcome == outcome for case in cases) for outcome in FAILURES}
     failed = {case: episode for case, episode in one.episodes.items() if episode["outcome"] in FAILURES}
+    if not failed and not any(counts.values()):
+        return ""
     told = " and ".join(_count(number, outcome) for outcome, number in counts.items())
     buttons = [
         f'<button type="button" data-policy="{escape(one.policy.label)}" data-case="{case}">'
         f"{escape(_told(case, episode, cases[case]))}</button>"
         for case, episode in failed.items()
     ]
-    note = paragraph(f"{told} in {len(cases)} cases. Failures among the recorded cases: {len(failed)}.")
-    return f"<h3>{escape(one.policy.title)}</h3>" + note + (bullets(buttons) if buttons else "")
+    summary = f"{one.policy.title}: {told} in {len(cases)} cases; {len(failed)} of them recorded"
+    return folded(summary, bullets(buttons)) if buttons else paragraph(summary)
 
 
 def _told(number: int, episode: dict[str, Any], case: Case) -> str:

@@ -11,13 +11,19 @@ from tint_sumo.study.tables import Lines
 
 
 def table(lines: Lines, caption: str) -> str:
-    """A table of cells in a box that scrolls by itself; the first line is its header, the first column its rows'."""
+    """A table of cells in a box that scrolls by itself; the first line is its header, the first column its rows'.
+
+    Every cell knows the name of its column, which stands beside it on a phone, where each row is a block.
+    """
     header, *rows = lines
     head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in header)
     body = "".join(
         "<tr>"
         + f'<th scope="row">{escape(row[0])}</th>'
-        + "".join(f"<td>{escape(cell)}</td>" for cell in row[1:])
+        + "".join(
+            f'<td data-column="{escape(name)}">{escape(cell)}</td>'
+            for name, cell in zip(header[1:], row[1:], strict=True)
+        )
         + "</tr>"
         for row in rows
     )

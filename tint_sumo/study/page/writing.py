@@ -18,6 +18,7 @@ from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, read_described
 from tint_sumo.study.page.charts import Chart, curve_chart, outcome_chart, world_charts
 from tint_sumo.study.page.choosing import choose
 from tint_sumo.study.page.episodes import Recordings, failure_lists, player_data, player_notes, record_episodes
+from tint_sumo.study.page.findings import MEANING_OF_P, what_came_out
 from tint_sumo.study.page.html import chart, folded, json_data, packed, paragraph, section, table
 from tint_sumo.study.page.latents import read_latents
 from tint_sumo.study.policy_jobs import read_curves
@@ -97,7 +98,7 @@ def _page(study: _Study) -> str:
     title = f"Study {study.out.resolve().name}"
     return Template(_static("page.html")).substitute(
         title=escape(title),
-        summary=escape(_summary(study.rows)),
+        summary="".join(map(paragraph, _summary(study.rows))),
         style=_static("page.css"),
         contents="".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, heading, _ in sections),
         sections="".join(section(name, heading, content) for name, heading, content in sections),
@@ -112,11 +113,12 @@ def _static(name: str) -> str:
     return (_STATIC / name).read_text(encoding="utf-8")
 
 
-def _summary(rows: Sequence[Row]) -> str:
+def _summary(rows: Sequence[Row]) -> list[str]:
     methods = len({(row.method, row.origin) for row in rows})
     seeds = max(len(row.seeds) for row in rows)
     episodes = sum(row.episodes * len(row.seeds) for row in rows)
-    return f"{methods} methods, up to {seeds} seeds of each, {episodes:,} episodes in all."
+    sizes = f"{methods} methods, up to {seeds} seeds of each, {episodes:,} episodes in all."
+    return [one for one in (what_came_out(rows), MEANING_OF_P, sizes) if one]
 
 
 def _shown(one: Chart, charts: list[Chart]) -> str:
@@ -163,9 +165,15 @@ def _player(study: _Study) -> str:
 def _failures(study: _Study) -> str:
     if not study.recordings.policies:
         return _left_out("no episodes were recorded")
-    return paragraph(
-        "A failure opens in the episode player. Of a collision it says which driver was hit: trait and route."
-    ) + failure_lists(study.recordings)
+    lists = failure_lists(study.recordings)
+    if not lists:
+        return paragraph("There are none: all tested policies succeeded in all cases.")
+    return (
+        paragraph(
+            "A failure opens in the episode player. Of a collision it says which driver was hit: trait and route."
+        )
+        + lists
+    )
 
 
 def _latents(study: _Study) -> str:

@@ -54,6 +54,7 @@ class Pane {
   async load(number) {
     const policy = this.contents.policies.find((one) => one.label === this.method.value);
     this.svg.toggleAttribute("hidden", !policy);
+    this.svg.style.borderTopColor = policy?.colour ?? "";
     this.details.toggleAttribute("hidden", !policy);
     this.episode = null;
     this.list.replaceChildren();
@@ -108,11 +109,12 @@ class Pane {
       one.attention === null ? "none" : `${percent(one.attention)} %`,
       one.brakes ? "brakes" : "no",
     ]);
-    const head = make("tr");
-    head.append(...["vehicle", "true trait", "taken for", "attention", "brakes"].map((name) => make("th", { scope: "col" }, name)));
+    const columns = ["vehicle", "true trait", "taken for", "attention", "brakes"];
+    const head = make("tr", { class: "head" });
+    head.append(...columns.map((name) => make("th", { scope: "col" }, name)));
     const rows = lines.map((line) => {
       const row = make("tr");
-      row.append(...line.map((cell, column) => make(column ? "td" : "th", column ? {} : { scope: "row" }, cell)));
+      row.append(...line.map((cell, column) => make(column ? "td" : "th", column ? { "data-column": columns[column] } : { scope: "row" }, cell)));
       return row;
     });
     this.table.replaceChildren(head, ...rows);

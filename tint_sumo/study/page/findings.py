@@ -1,0 +1,59 @@
+"""What a reader should know before all tables: what P means, and what came out, in a few sentences."""
+
+from collections.abc import Sequence
+
+from tint_sumo.config import share_words
+from tint_sumo.percentages import percent
+from tint_sumo.study.budgets import Conditions
+from tint_sumo.study.methods import METHODS, Learned
+from tint_sumo.study.rows import Summary, at_mixes, by_title, over_all_mixes
+
+MEANING_OF_P = (
+    "P is P(conservative): the probability that a driver is conservative, and yields when the ego moves in front of "
+    "it. All other drivers are aggressive and do not yield. The ego is not told who is who."
+)
+
+
+def what_came_out(rows: Sequence[Summary]) -> str:
+    """Return which method succeeded most often and which least often, and whether inferred traits helped.
+
+    Rates are means over the mixes of drivers that all methods were tested on; empty where there is none.
+    """
+    as_trained = [row for row in over_all_mixes(rows) if row.conditions == Conditions(row.conditions.p_conservative)]
+    methods = by_title(at_mixes(rows) or as_trained)
+    mixes = sorted(
+        set.intersection(*({row.conditions.p_conservative for row in own} for own in methods.values()))
+        if methods
+        else (),
+        key=str,
+    )
+    if not mixes:
+        return ""
+    shown = {title: [row for row in own if row.conditions.p_conservative in mixes] for title, own in methods.items()}
+    rates = {title: sum(row.rate("success") for row in own) / len(own) for title, own in shown.items()}
+    at = f"At P {_listed([share_words(mix) for mix in mixes])}"
+    if len(rates) == 1:
+        ((title, rate),) = rates.items()
+        return f"{at} the method {title} succeeded in {percent(rate)} % of the cases."
+    best, worst = max(rates, key=rates.__getitem__), min(rates, key=rates.__getitem__)
+    if rates[best] == rates[worst]:
+        return f"{at} all {len(rates)} methods succeeded in {percent(rates[best])} % of the cases."
+    told = f"{at} the method {best} succeeded most often, in {percent(rates[best])} % of the cases, and {worst} least "
+    told += f"often, in {percent(rates[worst])} %."
+    inferring = [title for title, own in shown.items() if _infers(own[0].method)]
+    without = [title for title, own in shown.items() if own[0].method == "no_labels"]
+    if inferring and without:
+        helped, bare = max(inferring, key=rates.__getitem__), max(without, key=rates.__getitem__)
+        told += f" The best method that infers traits, {helped}, reached {percent(rates[helped])} %; {bare}, which "
+        told += f"infers none, reached {percent(rates[bare])} %."
+    return told
+
+
+def _infers(name: str) -> bool:
+    method = METHODS.get(name)
+    return isinstance(method, Learned) and method.encoder is not None
+
+
+def _listed(words: Sequence[str]) -> str:
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last

@@ -28,6 +28,7 @@ from tint_sumo.scenes.scene import Scene
 _SWEEP_SPACING_M = 0.05  # between the poses of the ego whose boxes make up its swept area
 _STOP_MARGIN_M = 0.05  # more than the ego's modelled way may differ from SUMO's
 _PRECISION_M = 1e-6
+_COLLINEAR_M = 1e-9  # points of a way that lie so close to a straight line add nothing but time
 _SEAM_M = 0.02  # joins junctions to their roads in spite of rounding
 EGO = "ego"  # the name of its route
 _FIRST = ".0_"  # the first replica in ids of lanes
@@ -192,7 +193,7 @@ def _zones(scene: Scene, routes: Sequence[Path], way: Floats) -> ConflictZones:
     half_m = scene.network.lane_width_m / 2
     enter_m, inside_m, passed_m, stop_line_m, towards = [], [], [], [], []
     for route, path in zip(scene.routes, routes, strict=True):
-        middle = shapely.LineString(path.way)
+        middle = shapely.LineString(path.way).simplify(_COLLINEAR_M)
         off_m = shapely.distance(shapely.points(way) if scene.claim.by == "front" else boxes, middle)
         if off_m[ahead.argmax()] < half_m:
             raise InputError(f"the ego's start lies on route {route.name!r}; let it start beside the traffic")

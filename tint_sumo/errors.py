@@ -35,6 +35,10 @@ class JobError(RuntimeError):
     """Jobs were given up: which, and why, in one line. The command line exits with code 1 on it."""
 
 
+class DivergedError(JobError):
+    """A training has met a number that is not finite: at which step, in one line. It ends there if it is repeated."""
+
+
 BAD_PATHS = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError)  # another path mends these
 _NO_ROOM, _NO_RIGHT = "free some space, or choose another folder", "choose a folder that you may write to"
 _REMEDIES = {

@@ -13,9 +13,9 @@ from multiprocessing.context import ForkServerContext
 from types import FrameType
 from typing import Any, Literal, NoReturn
 
-from tint_sumo.errors import InputError
+from tint_sumo.errors import DivergedError, InputError
 
-Told = tuple[Literal["done", "refused", "failed"], Any]
+Told = tuple[Literal["done", "refused", "diverged", "failed"], Any]
 
 # A child forked from this process would share a running libsumo. One forked from the server, which runs no simulation,
 # starts in milliseconds with all modules loaded, where a new interpreter loads them for seconds.
@@ -98,6 +98,8 @@ def told(work: Callable[[], Any]) -> Told:
         return "done", work()
     except InputError as error:
         return "refused", str(error)
+    except DivergedError as error:
+        return "diverged", str(error)
     except (EOFError, ConnectionError):  # the other end is closed
         raise
     except Exception:
@@ -108,11 +110,13 @@ def answer(message: Told, worker: str) -> Any:
     """What a worker's work gave.
 
     Raises:
-        InputError, RuntimeError: it was refused, or it failed.
+        InputError, DivergedError, RuntimeError: it was refused, it diverged, or it failed.
     """
     kind, content = message
     if kind == "refused":
         raise InputError(content)
+    if kind == "diverged":
+        raise DivergedError(content)
     if kind == "failed":
         raise RuntimeError(f"{worker} failed:\n{content}")
     return content

@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from tint_sumo.errors import InputError
+from tint_sumo.errors import DivergedError, InputError
 from tint_sumo.executors import Local
 from tint_sumo.files import write_text
 from tint_sumo.processes import interrupt_on_sigterm
@@ -67,6 +67,8 @@ class FileJob:
         for done in range(self.reports):
             report(Progress(done, self.reports, "line", {"success": 0.5}))
             time.sleep(0.3 * (self.reports > 1))
+        if self.failure == "diverged":
+            raise DivergedError("at step 7")
         if self.failure == "refused":
             raise InputError("this is not for me")
         if self.failure == "died" or (self.failure == "died once" and self.tries == 1):

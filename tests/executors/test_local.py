@@ -87,7 +87,7 @@ def test_jobs_with_the_same_name_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("failure", "error", "tries"),
-    [("refused", InputError, 1), ("died", JobError, 3)],
+    [("refused", InputError, 1), ("diverged", JobError, 1), ("died", JobError, 3)],
 )
 def test_a_job_that_fails_is_named_and_the_others_finish(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], failure: str, error: type[Exception], tries: int
@@ -96,7 +96,7 @@ def test_a_job_that_fails_is_named_and_the_others_finish(
     needing = [FileJob("child", tmp_path, needs=("bad",)), FileJob("grandchild", tmp_path, needs=("child",))]
     with pytest.raises(error) as caught:
         Local(1).run([bad, good, *needing])
-    reason = "this is not for me" if failure == "refused" else "ended with exit code 7"
+    reason = {"refused": "this is not for me", "diverged": "at step 7", "died": "ended with exit code 7"}[failure]
     told = "" if failure == "refused" else "jobs failed: "
     assert str(caught.value) == (
         f"{told}bad: {reason}; skipped, because they need these: child, grandchild. "
@@ -104,12 +104,8 @@ def test_a_job_that_fails_is_named_and_the_others_finish(
     )
     assert (bad.tries, good.is_done(), needing[0].tries) == (tries, True, 0)
     lines = capsys.readouterr().err.splitlines()
-    assert f"bad: {error_word(failure)}, {tries} of {tries} times: {reason}" in lines
+    assert f"bad: {'failed' if failure == 'died' else failure}, {tries} of {tries} times: {reason}" in lines
     assert "grandchild: skipped, because it needs a job that was given up" in lines
-
-
-def error_word(failure: str) -> str:
-    return "refused" if failure == "refused" else "failed"
 
 
 def test_a_job_that_fails_once_is_tried_again(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor
 
-from tint_sumo.errors import InputError
+from tint_sumo.errors import DivergedError, InputError
 from tint_sumo.policy.buffer import SequenceBuffer
 from tint_sumo.policy.ppo import RecurrentPPO
 
@@ -205,6 +205,66 @@ def test_episodes_are_logged() -> None:
     assert model.ep_info_buffer is not None
     assert {info["l"] for info in model.ep_info_buffer} == {4}
     assert {"train/value_loss", "train/approx_kl", "train/clip_fraction"} <= set(model.logger.name_to_value)
+
+
+class Unbounded(Memory):
+    """Memory whose rewards or observations are not finite from some step on."""
+
+    def __init__(self, num_envs: int, broken: str, value: float) -> None:
+        self.broken, self.value, self.steps = broken, value, 0
+        super().__init__(num_envs)
+
+    def observe(self) -> np.ndarray:
+        shown = super().observe()
+        return np.full_like(shown, self.value) if self.broken == "observation" and self.steps > 32 else shown
+
+    def reward(self) -> np.ndarray:
+        self.steps += self.num_envs
+        return np.full(self.num_envs, self.value if self.broken == "reward" and self.steps > 32 else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("broken", "value", "step", "problem"),
+    [
+        ("reward", np.nan, 64, "loss"),
+        ("reward", np.inf, 64, "loss"),
+        ("observation", np.nan, 36, "outputs"),
+        ("observation", np.inf, 64, "loss"),  # the GRU's gates hide it from the outputs
+    ],
+)
+def test_numbers_that_are_not_finite_stop_the_training_before_they_reach_the_weights(
+    broken: str, value: float, step: int, problem: str
+) -> None:
+    model = make(Unbounded(4, broken, value), n_steps=8)
+    with pytest.raises(DivergedError, match=rf"diverged at step {step}: the .*{problem}.* not finite"):
+        model.learn(320)
+    assert weights(model).isfinite().all()
+
+
+def test_a_step_that_leads_to_weights_that_are_not_finite_stops_the_training() -> None:
+    model = make(Memory(4), n_steps=8, learning_rate=1e45, n_epochs=1, n_minibatches=1)
+    with pytest.raises(DivergedError, match=r"at step 32: the weights are not finite.* \(it is 1e\+45 there\)"):
+        model.learn(320)
+
+
+def test_weights_that_are_not_finite_are_refused() -> None:
+    model = make(FollowTheLeader(4))
+    before = weights(model)
+    parameters = model.get_parameters()
+    parameters["policy"]["action_net.bias"] = torch.tensor([0.0, torch.nan])
+    with pytest.raises(InputError, match=r"weights action_net\.bias are not finite"):
+        model.set_parameters(parameters)
+    assert torch.equal(weights(model), before)
+    model.set_parameters({**parameters, "policy": model.policy.state_dict()})
+
+
+@pytest.mark.parametrize("key", ["ego", "vehicles", "traits"])
+def test_an_observation_that_is_not_finite_is_refused(key: str) -> None:
+    env = FollowTheLeader(4)
+    model, observation = make(env), env.reset()
+    observation[key][:] = np.nan
+    with pytest.raises(InputError, match="not finite: its weights or the observations are not; look for NaN"):
+        model.predict(observation, deterministic=True)
 
 
 def test_more_minibatches_than_environments_are_refused() -> None:

@@ -26,8 +26,9 @@ from tint_sumo import traits
 from tint_sumo.checkpoints import CHECKPOINT_FILE, PICKLES
 from tint_sumo.config import PpoSettings, TraitSettings
 from tint_sumo.determinism import preserved_random_state
-from tint_sumo.errors import InputError
+from tint_sumo.errors import DivergedError, InputError
 from tint_sumo.policy import ClassifierTraits, EncoderTraits, OracleTraits, RecurrentPPO, StreamingTraits
+from tint_sumo.policy.loss import PpoLoss, ppo_loss
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.storage import load_policy_network, read_policy_card
 from tint_sumo.progress import Progress, Report
@@ -224,7 +225,7 @@ def draw(_: object = None) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("method", ["oracle", "vae", "streaming_critic"])
 def test_an_interrupted_run_ends_with_the_very_same_policy(method: str, tmp_path: Path, tiny: PpoSettings) -> None:
-    """Whoever looks on. Policies are kept, and looked at, after 128 and 256 decisions: between the interruptions.
+    """Whoever looks on. Policies are kept, and looked at, after 128 and 256 decisions, and trainings go on from there.
 
     Episodes of 10 s are 25 decisions, and end within rollouts of 16; traits are inferred after 5 decisions.
     """
@@ -232,7 +233,7 @@ def test_an_interrupted_run_ends_with_the_very_same_policy(method: str, tmp_path
     at_a_stretch, resumed = tmp_path / "at_a_stretch", tmp_path / "resumed"
     train = partial(train_policy, method, (0.1, 0.9), 512, 0, settings=settings)
     train(at_a_stretch)
-    for steps in (128, 192, 320):
+    for steps in (128, 256, 384):
         with pytest.raises(KeyboardInterrupt):
             train(resumed, report=interrupt_at(steps), film=look)
         torch.manual_seed(steps)  # another process has other random numbers
@@ -390,6 +391,30 @@ def test_a_checkpoint_cut_short_is_named(interrupted: Path, tmp_path: Path, tiny
     content = (out / CHECKPOINT_FILE).read_bytes()
     (out / CHECKPOINT_FILE).write_bytes(content[: len(content) // 2])
     assert CHECKPOINT_FILE in go_on(out, tiny)
+
+
+def test_a_training_that_diverges_says_where_and_keeps_its_last_finite_policy(
+    tmp_path: Path, tiny: PpoSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the fifth update, of one rollout each; once the cause is gone, the training goes on from there."""
+    train = partial(train_policy, "oracle", 0.4, 512, 0, settings=tiny)
+    updates: list[PpoLoss] = []
+
+    def loss(*args: Any, **kwargs: Any) -> PpoLoss:
+        updates.append(ppo_loss(*args, **kwargs))
+        return replace(updates[-1], total=updates[-1].total * (np.nan if len(updates) == 5 else 1.0))
+
+    with monkeypatch.context() as patched:
+        patched.setattr("tint_sumo.policy.ppo.ppo_loss", loss)
+        with pytest.raises(DivergedError, match=r"^the training diverged at step 320: .* not finite[^\n]*$") as error:
+            train(tmp_path / "run")
+    assert str(tmp_path / "run") in str(error.value)
+    assert files(tmp_path / "run") == [CHECKPOINT_FILE, CURVE_FILE, *SNAPSHOTS, "run.json"]
+    tensors = safetensors.torch.load_file(tmp_path / "run" / CHECKPOINT_FILE)
+    assert all(tensor.isfinite().all() for tensor in tensors.values())
+    train(tmp_path / "run")
+    train(tmp_path / "at_a_stretch")
+    assert_same_training(tmp_path / "run", tmp_path / "at_a_stretch")
 
 
 # Folders and arguments

@@ -77,6 +77,11 @@ def test_one_trait_alone_cannot_be_evaluated(model, separable):
         evaluate(model, windows, np.ones_like(conservative))
 
 
+def test_latents_that_are_not_finite_are_refused(model, separable):
+    with pytest.raises(InputError, match="latents of some windows are not finite"):
+        evaluate(model, *separable, noise_m=1e308)
+
+
 def test_encoding_in_parts_changes_nothing(separable, monkeypatch):
     model = Vae(TraitSettings(embedding_sizes=(4, 4), hidden_size=4)).eval()
     whole = encode_windows(model, separable[0], noise_m=0.1).mean

@@ -3,11 +3,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 
 from tests.bombs import BOMBS, bomb
 from tint_sumo.checkpoints import CHECKPOINT_FILE, PICKLES
-from tint_sumo.errors import InputError
+from tint_sumo.errors import DivergedError, InputError
 from tint_sumo.traits import TRAIT_METHODS, load, training
 from tint_sumo.traits.classifier import Classifier
 from tint_sumo.traits.evaluation import evaluate
@@ -110,6 +111,38 @@ def test_no_checkpoint_can_run_code(windows, small, tmp_path, monkeypatch, kind,
     with pytest.raises(InputError, match=f"{name} is .*; remove it to begin the training anew"):
         train(windows, small, tmp_path / "run")
     assert not (tmp_path / "marker").exists()
+
+
+def spoilt(windows, value):
+    states = windows.states.copy()
+    states[3, 0, 0] = value
+    return replace(windows, states=states)
+
+
+@pytest.mark.parametrize("method", sorted(TRAIT_METHODS))
+@pytest.mark.parametrize(
+    ("change", "value", "step"),
+    [
+        ({"learning_rate": 1e6}, 0.0, r"[1-9]\d*"),
+        ({"noise_m": 1e308}, 0.0, "0"),
+        ({}, np.nan, "0"),
+        ({}, np.inf, "0"),
+    ],
+)
+def test_a_training_that_diverges_says_at_which_step_and_keeps_the_last_finite_model(
+    street, small, tmp_path, method, change, value, step
+):
+    if method == "classifier" and "learning_rate" in change:
+        pytest.skip("the logistic loss of such weights is finite")
+    windows, conservative = street
+    labels = conservative if TRAIT_METHODS[method].uses_labels else None
+    settings = replace(small, **change)
+    with pytest.raises(DivergedError, match=rf"^the training diverged at step {step}: .*not finite[^\n]*$"):
+        train(spoilt(windows, value), settings, tmp_path, method=method, conservative=labels)
+    assert not (tmp_path / "model.json").exists()
+    if step != "0":
+        tensors = safetensors.torch.load_file(tmp_path / CHECKPOINT_FILE)
+        assert all(tensor.isfinite().all() for tensor in tensors.values())
 
 
 def test_bad_requests_leave_no_folder(windows, small, tmp_path):

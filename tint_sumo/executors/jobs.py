@@ -18,7 +18,7 @@ T_co = TypeVar("T_co", covariant=True)
 
 THREADS_PER_JOB = 1  # threads of torch: the jobs share the cores among them
 # After how many runs that have ended like this work is given up; it is lost with the machine that did it.
-ALLOWED = {"refused": 1, "failed": 3, "lost": 20}
+ALLOWED = {"refused": 1, "diverged": 1, "failed": 3, "lost": 20}
 REFRESH_S = 1.0
 
 
@@ -86,7 +86,7 @@ class Executor(Protocol):
     def run(self, jobs: Sequence[Job], progress: bool = True) -> None:
         """Run the jobs that are not done, in the given order as far as their needs allow.
 
-        A job that fails three times, or is refused once, is given up, and so are those that need it.
+        A job that fails three times, is refused or diverges once, is given up, and so are those that need it.
 
         Raises:
             InputError: needs are of no job, or go round in a circle; nothing is done.
@@ -106,7 +106,7 @@ class Begun:
     """A job is being done from now on."""
 
 
-How = Literal["done", "refused", "failed", "lost"]  # lost: with its machine
+How = Literal["done", "refused", "diverged", "failed", "lost"]  # lost: with its machine
 
 
 @dataclass(frozen=True)

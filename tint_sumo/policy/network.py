@@ -242,12 +242,15 @@ class GruPolicy(ActorCriticPolicy):
 
         Returns:
             Actions (N, ...), values (N, 1), log-probabilities (N,) and new states (N, hidden_size).
+
+        Raises:
+            FloatingPointError: what the actions follow from is not finite.
         """
         with self._autocast():
             outputs, states = self._run(obs, states, episode_starts.unsqueeze(0))
             latent_actor = self.mlp_extractor.forward_actor(outputs)
             latent_critic = self._latent_critic(obs, outputs)
-        distribution = self._get_action_dist_from_latent(latent_actor.float())
+        distribution = self._finite_distribution(latent_actor)
         actions = distribution.get_actions(deterministic=deterministic)
         values = self.value_net(latent_critic.float())
         return actions.view(-1, *self._action_shape()), values, distribution.log_prob(actions), states
@@ -285,7 +288,17 @@ class GruPolicy(ActorCriticPolicy):
         with self._autocast():
             outputs, states = self._run(obs, states, episode_starts.unsqueeze(0))
             latent = self.mlp_extractor.forward_actor(outputs)
-        return self._get_action_dist_from_latent(latent.float()), states
+        return self._finite_distribution(latent), states
+
+    def _finite_distribution(self, latent_actor: Tensor) -> Distribution:
+        """The distribution of actions from the actor's last hidden layer.
+
+        Raises:
+            FloatingPointError: that is not finite.
+        """
+        if not latent_actor.isfinite().all():
+            raise FloatingPointError("the policy's outputs are not finite: its weights or the observations are not")
+        return self._get_action_dist_from_latent(latent_actor.float())
 
     @torch.no_grad()
     def predict(
@@ -305,13 +318,19 @@ class GruPolicy(ActorCriticPolicy):
 
         Returns:
             The action or N actions, and the state for the next call.
+
+        Raises:
+            InputError: the observation or the weights have numbers that are not finite.
         """
         self.set_training_mode(False)
         obs, vectorized = self.obs_to_tensor(observation)
         count = len(next(iter(obs.values()))) if isinstance(obs, dict) else len(obs)
         states = self.initial_states(count) if state is None else torch.as_tensor(state[0], device=self.device)
         starts = np.zeros(count, bool) if episode_start is None else np.asarray(episode_start).reshape(count)
-        distribution, states = self.get_distribution(obs, states, torch.as_tensor(starts, device=self.device))
+        try:
+            distribution, states = self.get_distribution(obs, states, torch.as_tensor(starts, device=self.device))
+        except FloatingPointError as error:
+            raise InputError(f"{error}; look for NaN and infinity in both") from None
         actions = distribution.get_actions(deterministic=deterministic).view(-1, *self._action_shape()).cpu().numpy()
         if isinstance(self.action_space, spaces.Box):
             actions = np.clip(actions, self.action_space.low, self.action_space.high)

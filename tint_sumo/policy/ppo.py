@@ -1,12 +1,13 @@
 """Proximal policy optimisation of recurrent policies, as a Stable-Baselines3 algorithm."""
 
 import io
+import math
 import pathlib
 import pickle
 import zipfile
 import zlib
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -16,13 +17,13 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
 from tint_sumo.config import PpoSettings
-from tint_sumo.errors import InputError
+from tint_sumo.errors import DivergedError, InputError
 from tint_sumo.files import whole_file
 from tint_sumo.policy.buffer import SequenceBuffer, Sequences, buffer_class
 from tint_sumo.policy.loss import Decisions, ppo_loss
@@ -43,7 +44,8 @@ class RecurrentPPO(OnPolicyAlgorithm):
     ``learn``, ``predict``, ``save``, ``load``, callbacks, logging and ``set_parameters`` are Stable-Baselines3's.
     Minibatches hold the whole sequences of some environments, so gradients reach back to the rollout's start. Episodes
     that end by time limit are bootstrapped with the value of their terminal observation. An interrupted run goes on
-    with ``load(path, env).learn(remaining, reset_num_timesteps=False)``, schedules included.
+    with ``load(path, env).learn(remaining, reset_num_timesteps=False)``, schedules included. ``learn`` raises
+    DivergedError as soon as a loss, a gradient, a weight or an output of the policy is not finite.
 
     Args:
         policy: ``"GruPolicy"`` or a class with its methods.
@@ -147,9 +149,12 @@ class RecurrentPPO(OnPolicyAlgorithm):
             obs, starts = self._last_obs, self._last_episode_starts
             assert obs is not None and starts is not None, "learn resets the environment before it collects"
             with torch.no_grad():
-                action_tensor, values, log_probs, states = self.policy(
-                    obs_as_tensor(obs, self.device), self.hidden_states, self._on_device(starts)
-                )
+                try:
+                    action_tensor, values, log_probs, states = self.policy(
+                        obs_as_tensor(obs, self.device), self.hidden_states, self._on_device(starts)
+                    )
+                except FloatingPointError as error:
+                    raise self._diverged(str(error)) from None
             actions = action_tensor.cpu().numpy()
             new_obs, rewards, dones, infos = env.step(self._within_bounds(actions))
             self.num_timesteps += env.num_envs
@@ -207,6 +212,8 @@ class RecurrentPPO(OnPolicyAlgorithm):
                 for name, value in self._update(batch).items():
                     records[name].append(value)
         self._n_updates += self.n_epochs
+        if not all(parameter.isfinite().all() for parameter in self.policy.parameters()):
+            raise self._diverged("the weights are not finite")
         for name, values in records.items():
             self.logger.record(f"train/{name}", np.mean(values))
         buffer = self.rollout_buffer
@@ -224,7 +231,9 @@ class RecurrentPPO(OnPolicyAlgorithm):
         loss = ppo_loss(decisions, clip_range=self.clip_range, ent_coef=self.ent_coef, vf_coef=self.vf_coef)
         self.policy.optimizer.zero_grad()
         loss.total.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+        if not (math.isfinite(loss.total.item()) and math.isfinite(norm.item())):
+            raise self._diverged("the loss or its gradient is not finite")
         self.policy.optimizer.step()
         return {
             "loss": loss.total.item(),
@@ -234,6 +243,31 @@ class RecurrentPPO(OnPolicyAlgorithm):
             "approx_kl": loss.approx_kl.item(),
             "clip_fraction": loss.clip_fraction.item(),
         }
+
+    def _diverged(self, problem: str) -> DivergedError:
+        rate = self.policy.optimizer.param_groups[0]["lr"]
+        return DivergedError(
+            f"the training diverged at step {self.num_timesteps}: {problem}; "
+            f"choose a lower learning_rate (it is {rate:g} there), and look for extreme observations and rewards"
+        )
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | TensorDict,
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+    ) -> None:
+        """Take over parameters; arguments as in Stable-Baselines3.
+
+        Raises:
+            InputError: weights are not finite; nothing has changed then.
+        """
+        if isinstance(load_path_or_dict, dict):
+            weights: Mapping[str, Any] = load_path_or_dict.get("policy", {})  # type: ignore[assignment]
+            for name, tensor in weights.items():
+                if not tensor.isfinite().all():
+                    raise InputError(f"weights {name} are not finite; give others")
+        super().set_parameters(load_path_or_dict, exact_match, device)
 
     def learn(
         self,

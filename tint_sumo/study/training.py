@@ -22,7 +22,7 @@ from tint_sumo.checkpoints import remove_checkpoint, write_checkpoint
 from tint_sumo.config import LATENT_SIZE, PpoSettings, Share, ends, require_share
 from tint_sumo.determinism import preserved_random_state, single_threaded
 from tint_sumo.envs.rows import OUTCOMES
-from tint_sumo.errors import InputError
+from tint_sumo.errors import DivergedError, InputError
 from tint_sumo.files import claim_folder, write_text
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
@@ -98,6 +98,7 @@ def train_policy(
 
     Raises:
         InputError: bad values, no such method or trait model, ``out`` holds another run, or its checkpoint is damaged.
+        DivergedError: a loss or a weight is not finite; the checkpoint is of before that.
     """
     learned = find_learned(method)
     _require_drivers(learned, p_conservative, scene)
@@ -239,6 +240,9 @@ def _learn(
         except KeyboardInterrupt:
             watch.write_checkpoint()
             raise
+        except DivergedError as error:
+            watch.write_checkpoint()
+            raise DivergedError(f"{error}; the checkpoint in {out} holds the last finite policy") from None
     return model
 
 

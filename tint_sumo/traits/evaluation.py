@@ -171,13 +171,19 @@ def fit_line(
 
 
 def encode_windows(model: TraitModel, windows: Windows, *, noise_m: float = 0.0, seed: int = 0) -> Latents:
-    """Latents of N windows, measured with noise drawn from ``seed``."""
+    """Latents of N windows, measured with noise drawn from ``seed``.
+
+    Raises:
+        InputError: they are not finite.
+    """
     parts = []
     with torch.inference_mode():
         for states, length in _measured(windows, noise_m, seed):
             mean, log_var = model.encode(states, length)
             parts.append(torch.stack((mean, torch.exp(0.5 * log_var))))
     mean, std = torch.cat(parts, dim=1).numpy()
+    if not np.isfinite(mean).all():
+        raise InputError("the latents of some windows are not finite; check the data, the noise and the model")
     return Latents(mean, std)
 
 

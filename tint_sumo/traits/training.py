@@ -1,6 +1,7 @@
 """Training of a trait model on windows; interruptible and exactly resumable."""
 
 import hashlib
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -25,7 +26,7 @@ from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.dataset.window_file import WindowFile
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.determinism import preserved_random_state, single_threaded
-from tint_sumo.errors import InputError
+from tint_sumo.errors import DivergedError, InputError
 from tint_sumo.files import claim_folder
 from tint_sumo.progress import Progress, Report, silent
 from tint_sumo.ranges import Range
@@ -72,6 +73,7 @@ def train(
 
     Raises:
         InputError: unknown method, no windows, ``out`` holds another run, or its checkpoint is damaged.
+        DivergedError: the windows or the loss are not finite; the checkpoint is of before that.
     """
     model_type = find_trait_method(method)
     if len(windows) == 0:
@@ -132,18 +134,26 @@ class _Run:
         """
         generator = self._generator(0)
         self.model.fit_features(part.with_noise(self.settings.noise_m, generator) for part in self.data.parts())
+        if not (self.model.feature_mean.isfinite().all() and self.model.feature_scale.isfinite().all()):
+            raise DivergedError("the training diverged at step 0: the windows are not finite; check data and noise")
         done, loss = self._resume(out)
         settings = {"method": self.model.method, "seed": self.seed, **asdict(self.settings)}
         log = open_log(out, settings, ["loss/total"], done)
         saved_at = time.monotonic()
+        state = self._checkpoint(done, loss)
         report(self._progress(done, 0, loss))
         for epoch in range(done, self.settings.epochs):
-            loss = self._run_epoch(epoch, report)
+            try:
+                loss = self._run_epoch(epoch, report)
+            except DivergedError as error:
+                write_checkpoint(out, state)
+                raise DivergedError(f"{error}; the checkpoint in {out} holds the model of {epoch} epochs") from None
             for name, value in loss.items():
                 log.record(f"loss/{name}", value)
             log.dump(epoch + 1)
+            state = self._checkpoint(epoch + 1, loss)
             if time.monotonic() - saved_at >= CHECKPOINT_INTERVAL_S:
-                write_checkpoint(out, self._checkpoint(epoch + 1, loss))
+                write_checkpoint(out, state)
                 saved_at = time.monotonic()
         log.close()
         return loss
@@ -163,7 +173,13 @@ class _Run:
         for number, start in enumerate(starts):
             index = order[start : start + self.settings.batch_size]
             batch = self.data.batch(index, generator).with_noise(self.settings.noise_m, generator)
-            terms = self._step(batch, 1.0 - (epoch + number / len(starts)) / self.settings.epochs, generator)
+            try:
+                terms = self._step(batch, 1.0 - (epoch + number / len(starts)) / self.settings.epochs, generator)
+            except FloatingPointError as error:
+                raise DivergedError(
+                    f"the training diverged at step {epoch * len(starts) + number + 1}: {error}; choose a lower "
+                    f"learning_rate than {self.settings.learning_rate:g}, and check data and noise"
+                ) from None
             for name, value in terms.items():
                 sums[name] = sums.get(name, 0.0) + value
             means = {name: value / (number + 1) for name, value in sums.items()}
@@ -171,14 +187,20 @@ class _Run:
         return means
 
     def _step(self, batch: WindowBatch, remaining: float, generator: torch.Generator) -> dict[str, float]:
-        """One gradient step at the fraction ``remaining`` of the learning rate; the loss terms."""
+        """One gradient step at the fraction ``remaining`` of the learning rate; the loss terms.
+
+        Raises:
+            FloatingPointError: the loss or its gradient is not finite; the weights are as before.
+        """
         for group in self.optimiser.param_groups:
             group["lr"] = self.settings.learning_rate * remaining
         with torch.autocast("cpu", torch.bfloat16, enabled=self.settings.hidden_size >= BFLOAT16_HIDDEN_SIZE):
             terms = self.model.loss(batch, generator)
         self.optimiser.zero_grad()
         torch.autograd.backward(terms["total"])
-        nn.utils.clip_grad_norm_(self.model.parameters(), MAX_GRAD_NORM)
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), MAX_GRAD_NORM)
+        if not (math.isfinite(terms["total"].item()) and math.isfinite(norm.item())):
+            raise FloatingPointError("the loss or its gradient is not finite")
         self.optimiser.step()
         return {name: value.item() for name, value in terms.items()}
 

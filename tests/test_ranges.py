@@ -122,7 +122,7 @@ def test_python_gets_the_same_limits_as_files(base: Any, name: str) -> None:
 
 
 def test_a_length_counts_the_items() -> None:
-    with pytest.raises(InputError, match="embedding_sizes must have 0 to 8 values, not 9"):
+    with pytest.raises(InputError, match="embedding_sizes must have 1 to 8 values, not 9"):
         PolicySettings(embedding_sizes=(4,) * 9)
     assert Length(0, 2).check((1, 2)) == (1, 2)
 

@@ -52,6 +52,7 @@ Weight = Annotated[float, Range(0.0, 1e6)]  # of a term of a loss
 LearningRate = Annotated[float, Range(1e-12, 1e6)]
 Layer = Annotated[int, Range(1, 2048)]
 Layers = Annotated[Many[Layer], Length(0, 8)]
+SomeLayers = Annotated[Many[Layer], Length(1, 8)]
 Decisions = Annotated[int, Range(1, 10**12)]
 DriverSpeedMps = Annotated[float, Range(0.01, 60.0)]  # SUMO writes 0 for less than 0.01
 ArrivalsPerS = Annotated[float, Range(1e-6, 100.0)]
@@ -333,10 +334,10 @@ class TraitSettings:
 class PolicySettings:
     """The paper's policy network."""
 
-    embedding_sizes: Layers = (150, 100)  # code
+    embedding_sizes: SomeLayers = (150, 100)  # code
     score_sizes: Layers = (100, 100)  # code
     context_size: Layer = 50  # code
-    joint_sizes: Layers = (150, 100, 64)  # code
+    joint_sizes: SomeLayers = (150, 100, 64)  # code
     hidden_size: Layer = 256  # code
     head_sizes: Layers = (256, 256)  # code
     attention: bool = True  # without it, all vehicles count the same (the paper's ablation, IV-D)
@@ -344,6 +345,8 @@ class PolicySettings:
 
     def __post_init__(self) -> None:
         require_ranges(self)
+        if self.attention and not self.score_sizes:
+            raise InputError("score_sizes must have 1 to 8 values with attention, not 0")
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 import json
 import pickle
+import resource
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from safetensors.torch import load_file
 
 from tests.bombs import BOMBS, bomb
 from tests.simulation.scenes import T
@@ -19,6 +21,7 @@ from tint_sumo.files import shipped
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
 from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS, trait_space
+from tint_sumo.weights import SHA256, write_weights
 
 from .tasks import SMALL
 
@@ -139,6 +142,35 @@ def test_damaged_weights_are_reported(saved: Path, kept: int) -> None:
     assert "policy.safetensors is damaged" in refused(saved)
 
 
+def test_weights_are_compared_with_the_checksum_of_the_card(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    content = bytearray(weights_file(saved).read_bytes())
+    content[-1] ^= 1  # of the last number
+    weights_file(saved).write_bytes(content)
+    assert "policy.safetensors is damaged: it has another checksum than policy.json says" in refused(saved)
+    card = read_policy_card(saved)
+    del card[SHA256]
+    card_file(saved).write_text(json.dumps(card))
+    load_policy_network(saved)
+    assert "policy.json has no checksum of the weights, which are not verified" in capsys.readouterr().err
+
+
+def test_weights_that_are_not_finite_are_refused(saved: Path) -> None:
+    weights = load_file(weights_file(saved))
+    name = sorted(weights)[0]
+    weights[name].view(-1)[0] = float("nan")
+    card_file(saved).write_text(json.dumps({**read_policy_card(saved), **write_weights(weights_file(saved), weights)}))
+    assert f"has numbers that are not finite in {name}" in refused(saved)
+
+
+def test_no_memory_is_taken_for_a_network_that_its_weights_do_not_have(saved: Path) -> None:
+    card = read_policy_card(saved)
+    card["network"]["settings"] |= {"embedding_sizes": [2048] * 8, "score_sizes": [2048] * 8, "hidden_size": 2048}
+    card_file(saved).write_text(json.dumps(card))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert "does not fit the weights beside it" in refused(saved)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB; the network would have 400,000
+
+
 def test_missing_files_are_reported(saved: Path) -> None:
     weights_file(saved).unlink()
     assert f"no file {weights_file(saved)}" in refused(saved)
@@ -172,7 +204,7 @@ def test_an_unreadable_card_is_reported(saved: Path, text: str) -> None:
         {"settings": [1]},
         {"settings": {"depth": 3}},
         {"settings": {"embedding_sizes": []}},
-        {"settings": {"embedding_sizes": 5}},
+        {"settings": {"embedding_sizes": -5}},
         {"settings": {"embedding_sizes": ["many"]}},
         {"settings": {"hidden_size": -1}},
         {"settings": {"hidden_size": 10**12}},

@@ -4,25 +4,37 @@ Neither can hold code, so that reading a policy from anywhere is safe; Stable-Ba
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import safetensors.torch
 from gymnasium import spaces
-from safetensors import SafetensorError
 from torch import Tensor
 
-from tint_sumo.config import PolicySettings
+from tint_sumo.config import PolicySettings, Slots
 from tint_sumo.determinism import preserved_random_state
 from tint_sumo.envs.episodes import observation_space
 from tint_sumo.errors import InputError
-from tint_sumo.files import read_json, whole_file, write_json
+from tint_sumo.files import read_json, write_json
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS, trait_space
 from tint_sumo.policy.trait_sources import OracleTraits
+from tint_sumo.ranges import Range
+from tint_sumo.structures import FieldError, build
+from tint_sumo.weights import read_weights, write_weights
 
 _NETWORK = "network"  # the card's entry with all that is needed to build the network
+
+
+@dataclass(frozen=True)
+class _Network:
+    """What the card says of the network."""
+
+    settings: PolicySettings
+    trait_size: Annotated[int, Range(0, 64)]
+    critic_sees_true_traits: bool
+    max_vehicles: Slots
+    actions: Annotated[int, Range(1, 100)]
 
 
 def save_policy(policy: GruPolicy, stem: Path, card: Mapping[str, Any]) -> None:
@@ -44,9 +56,8 @@ def save_policy(policy: GruPolicy, stem: Path, card: Mapping[str, Any]) -> None:
         "max_vehicles": traits_shape[0],
         "actions": int(policy.action_space.n),
     }
-    with whole_file(weights_file(stem)) as partial:
-        partial.write_bytes(safetensors.torch.save(_own_weights(policy)))  # save_model would hide it from others
-    write_json(card_file(stem), {**card, _NETWORK: network})
+    checksum = write_weights(weights_file(stem), _own_weights(policy))
+    write_json(card_file(stem), {**card, _NETWORK: network, **checksum})
 
 
 def load_policy_network(stem: Path) -> GruPolicy:
@@ -55,20 +66,19 @@ def load_policy_network(stem: Path) -> GruPolicy:
     Raises:
         InputError: a file is missing or damaged, or the card does not fit the weights.
     """
-    network = read_policy_card(stem)[_NETWORK]
+    card = read_policy_card(stem)
     try:
+        network: _Network = build(_Network, card[_NETWORK])
         with preserved_random_state():
+            weights = read_weights(weights_file(stem), card_file(stem), lambda: _build(network), card)
             policy = _build(network)
-    except (LookupError, TypeError, ValueError, AttributeError, MemoryError, RuntimeError) as error:
+    except FieldError as error:
+        raise InputError(f"{card_file(stem)}: unusable network ({error}); restore the file") from None
+    except (LookupError, TypeError, MemoryError, RuntimeError) as error:
         raise InputError(f"{card_file(stem)}: unusable network ({error!r}); restore the file") from None
-    try:
-        safetensors.torch.load_model(policy, weights_file(stem))
-    except FileNotFoundError:
-        raise InputError(f"policy: no file {weights_file(stem)}; restore it or train the policy again") from None
-    except (OSError, SafetensorError):
-        raise InputError(f"{weights_file(stem)} is damaged; restore the file or train the policy again") from None
-    except RuntimeError:
-        raise InputError(f"{card_file(stem)} does not fit the weights beside it; restore both files") from None
+    if weights.keys() != _own_weights(policy).keys():
+        raise InputError(f"{card_file(stem)} does not fit the weights beside it; restore both files")
+    policy.load_state_dict(weights, strict=False)  # the extractor has other names, too
     policy.set_training_mode(False)
     return policy.requires_grad_(False)
 
@@ -99,13 +109,10 @@ def card_file(stem: Path) -> Path:
     return stem.with_name(stem.name + ".json")
 
 
-def _build(network: Mapping[str, Any]) -> GruPolicy:
-    settings: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in network["settings"].items()
-    }
-    slots = network["max_vehicles"]
-    parts = {**observation_space(slots).spaces, TRAITS: trait_space(slots, network["trait_size"])}
-    if network["critic_sees_true_traits"]:
+def _build(network: _Network) -> GruPolicy:
+    slots = network.max_vehicles
+    parts = {**observation_space(slots).spaces, TRAITS: trait_space(slots, network.trait_size)}
+    if network.critic_sees_true_traits:
         parts[TRUE_TRAITS] = trait_space(slots, OracleTraits().size)
-    actions = spaces.Discrete(network["actions"])
-    return GruPolicy(spaces.Dict(parts), actions, lambda _: 0.0, settings=PolicySettings(**settings))
+    actions = spaces.Discrete(network.actions)
+    return GruPolicy(spaces.Dict(parts), actions, lambda _: 0.0, settings=network.settings)

@@ -1,18 +1,18 @@
 """Trait models as files: NAME.safetensors with the weights and NAME.json, the card that says what they are."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
-
-import safetensors.torch
-from safetensors import SafetensorError
+from typing import Annotated, Any
 
 from tint_sumo.config import TraitSettings
 from tint_sumo.determinism import preserved_random_state
 from tint_sumo.errors import InputError, refuse_old_name
-from tint_sumo.files import read_json, shipped, whole_file, write_json
+from tint_sumo.files import read_json, shipped, write_json
+from tint_sumo.ranges import Range
+from tint_sumo.structures import FieldError, build
 from tint_sumo.traits.model import TRAIT_METHODS, TraitModel
+from tint_sumo.weights import read_weights, write_weights
 
 RUN_MODEL = "model"  # name of the model in the folder of a training run
 
@@ -20,13 +20,12 @@ RUN_MODEL = "model"  # name of the model in the folder of a training run
 def save(model: TraitModel, stem: Path, card: Mapping[str, Any]) -> None:
     """Write ``stem``.safetensors and ``stem``.json.
 
-    The card holds method, settings and latent size of the model, and whatever else ``card`` says about it (data, seed,
-    accuracy). It is written last, so that where there is a card there are weights.
+    The card holds method, settings and latent size of the model, the checksum of its weights, and whatever else
+    ``card`` says about it (data, seed, accuracy). It is written last, so that where there is a card there are weights.
     """
-    with whole_file(_weights_file(stem)) as partial:
-        partial.write_bytes(safetensors.torch.save(model.state_dict()))  # save_file would make it unreadable to others
+    checksum = write_weights(_weights_file(stem), model.state_dict())
     described = {"method": model.method, "latent_size": model.latent_size, "settings": asdict(model.settings)}
-    write_json(_card_file(stem), {**card, **described})
+    write_json(_card_file(stem), {**card, **described, **checksum})
 
 
 def load(name_or_path: str | Path, latent_size: int | None = None) -> TraitModel:
@@ -47,12 +46,10 @@ def load(name_or_path: str | Path, latent_size: int | None = None) -> TraitModel
             f"trait model {name_or_path} has {card['latent_size']} latents where {latent_size} are needed; "
             "use a model trained with that latent size"
         )
+    weights = read_weights(_weights_file(stem), _card_file(stem), lambda: _build(card, stem), card)
     model = _build(card, stem)
     try:
-        weights = safetensors.torch.load_file(_weights_file(stem))
         model.load_state_dict(weights)
-    except (OSError, SafetensorError):
-        raise InputError(f"{_weights_file(stem)} is damaged; train the model again or restore the file") from None
     except RuntimeError:
         raise InputError(
             f"{_card_file(stem)} does not fit the weights beside it; restore both files of the model"
@@ -108,24 +105,43 @@ def _is_trait_model(weights: Path) -> bool:
     return True
 
 
+@dataclass(frozen=True)
+class _Described:
+    """What a card must say of its model; it may say more."""
+
+    method: str
+    latent_size: Annotated[int, Range(1, 64)]
+    settings: TraitSettings
+
+
 def _checked_card(stem: Path) -> dict[str, Any]:
     card = read_json(_card_file(stem), "card of the trait model")
-    method, latent_size, settings = (card.get(key) for key in ("method", "latent_size", "settings"))
-    if method not in TRAIT_METHODS or not isinstance(latent_size, int) or not isinstance(settings, dict):
+    if card.get("method") not in TRAIT_METHODS:
         raise InputError(
             f"{_card_file(stem)} is not the card of a trait model (methods: {', '.join(sorted(TRAIT_METHODS))}); "
             "restore the file or train the model again"
         )
+    _described(card, stem)
     return card
 
 
+def _described(card: Mapping[str, Any], stem: Path) -> _Described:
+    try:
+        known = {field.name: card[field.name] for field in fields(_Described) if field.name in card}
+        found: _Described = build(_Described, known)
+    except FieldError as error:
+        raise InputError(
+            f"{_card_file(stem)} is not the card of a trait model: unusable settings ({error}); "
+            "restore the file or train the model again"
+        ) from None
+    return found
+
+
 def _build(card: Mapping[str, Any], stem: Path) -> TraitModel:
-    settings: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in card["settings"].items()
-    }
+    found = _described(card, stem)
     try:
         with preserved_random_state():
-            return TRAIT_METHODS[card["method"]](TraitSettings(**settings), card["latent_size"])
+            return TRAIT_METHODS[found.method](found.settings, found.latent_size)
     except (TypeError, ValueError, RuntimeError, IndexError) as error:
         raise InputError(
             f"{_card_file(stem)}: unusable settings ({error}); restore the file or train the model again"

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import TYPE_CHECKING, Any, overload
 
 from tint_sumo.config import (
@@ -125,14 +126,14 @@ SCENES: dict[str, Callable[[], Scene]] = {}
 
 
 def register(make: Callable[[], Scene]) -> Callable[[], Scene]:
-    """Make a scene known under the name of the function that makes it.
+    """Make a scene known under the name of the function that makes it, which is called once.
 
     Raises:
         ValueError: the name is taken.
     """
     if make.__name__ in SCENES:
         raise ValueError(f"two scenes are called {make.__name__!r}")
-    SCENES[make.__name__] = make
+    SCENES[make.__name__] = cache(make)
     return make
 
 

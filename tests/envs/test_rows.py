@@ -1,13 +1,33 @@
 """What is written of a step made by hand."""
 
 import math
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tint_sumo.envs.rows import OUTCOMES, Scales, TaskRules, judge, observe, observe_tracks, outcome_name, row_type
+from tint_sumo.config import REWARD_PRESETS
+from tint_sumo.envs.rows import (
+    OUTCOMES,
+    Scales,
+    TaskRules,
+    add_up,
+    copied,
+    end_info,
+    fields_of,
+    judge,
+    observation_of,
+    observe,
+    observe_tracks,
+    outcome_name,
+    outcome_names,
+    row_type,
+    start_info,
+    step_info,
+)
+from tint_sumo.scenes import find_scene
 from tint_sumo.scenes.geometry import POSE
 
 RULES = TaskRules(goal_m=30.0, step_limit=100, goal=2.5, collision=-2.0, speed_weight_per_mps=0.05, step=-0.25)
@@ -119,3 +139,45 @@ def test_tracks_are_seen_with_the_noise_along_the_way() -> None:
     np.testing.assert_array_equal(rows["passed"], [[1, 0, 0, 0]])
     observe_tracks(np.array([4.0]), passed_m, present, route, vehicles, front_m, leader, gap_m, noise_m, rows)
     assert not rows["passed"].any()
+
+
+def test_a_decision_s_rewards_are_summed_up_and_its_end_is_kept() -> None:
+    names = ("goal", "collision", "speed", "step", "reward")
+    before, rows = np.zeros(2, row_type(1)), np.zeros(2, row_type(1))
+    for number, name in enumerate(names, start=1):
+        before[name], rows[name] = number, 10.0 * number
+    before["outcome"], before["time_s"], rows["time_s"] = [0, 3], 0.1, 0.2
+    add_up(before, rows)
+    assert [rows[name].tolist() for name in names] == [[11.0 * number, number] for number in range(1, 6)]
+    assert rows["outcome"].tolist() == [0, 3] and rows["time_s"].tolist() == [0.2, 0.1]
+
+
+def test_what_is_told_of_a_row() -> None:
+    rows = np.zeros(2, row_type(2))
+    rows["outcome"], rows["time_s"], rows["traits"], rows["goal"] = [0, 1], 0.3, [[1, -1], [0, 0]], 2.5
+    going_on, over = map(fields_of, rows)
+    assert set(observation_of(going_on)) == {"ego", "vehicles", "mask"}
+    begun = start_info(going_on, ("traits", "passed"))
+    assert begun["traits"].tolist() == [1, -1] and begun["passed"].tolist() == [0, 0]
+    assert {name: begun[name] for name in ("outcome", "time_s")} == {"outcome": "", "time_s": 0.3}
+    assert set(begun) == {"traits", "passed", "outcome", "time_s"}
+    begun["traits"][:] = 5
+    assert rows["traits"][0].tolist() == [1, -1], "an info keeps what it told"
+    terms = {"goal": 2.5, "collision": 0.0, "speed": 0.0, "step": 0.0}
+    assert set(step_info(going_on, ("traits",), {})) == {"traits", "outcome", "time_s", "reward_terms"}
+    told = step_info(over, (), {"trait": "aggressive"})
+    assert told.pop("reward_terms") == terms
+    assert told == {"outcome": "success", "time_s": 0.3, "is_success": True, "collision": {"trait": "aggressive"}}
+    assert end_info("timeout", {}) == {"is_success": False} and end_info("", {}) == {}
+    assert outcome_names(np.array([0, 3, 2, 1])).tolist() == ["", "collision", "timeout", "success"]
+    copies = copied(rows)
+    assert set(copies) == set(rows.dtype.names or ()) and copies["goal"].tolist() == [2.5, 2.5]
+    copies["goal"][:] = 0.0
+    assert rows["goal"].tolist() == [2.5, 2.5]
+
+
+def test_rules_are_those_of_the_scene_and_of_the_preset() -> None:
+    scene, preset = find_scene("four_way"), REWARD_PRESETS["authors"]
+    assert TaskRules.of(scene, preset) == TaskRules(34.0, 500, 2.5, -2.0, 0.05 / 3.0, -0.013)
+    assert TaskRules.of(replace(scene, time_limit_s=0.3), preset).step_limit == 3
+    assert TaskRules.of(replace(scene, time_limit_s=3.0, step_s=0.2), preset).step_limit == 15

@@ -156,6 +156,17 @@ def test_drivers_who_wait_come_after_their_time() -> None:
     assert demand._wanted_time_s[0, 0] == 50.0 + demand._streams[0][0].upcoming.wait_s > 50.0
 
 
+def test_a_newcomer_keeps_its_gap_to_the_back_of_the_one_before() -> None:
+    scene = played()
+    demand, slots = Demand(1, members(scene.population), layout(scene)), Slots(1, layout(scene))
+    demand.begin(0, np.random.SeedSequence(0))
+    slots.newest[0] = [3, 4]
+    slots.front_m[0, 4] = 0.0
+    for more_m, admitted in ((-1e-6, []), (1e-6, [(0, 0)])):
+        slots.front_m[0, 3] = 2 * LENGTH_M + demand._streams[0][0].upcoming.gap_m + more_m
+        assert list(demand.admit(slots, np.zeros(1))) == admitted
+
+
 def test_mixes_are_drawn_from_the_range_of_the_traffic() -> None:
     scene = played((0.2, 0.8))  # type: ignore[arg-type]
     demand = Demand(1, members(scene.population), layout(scene))

@@ -1,12 +1,12 @@
 import math
 from dataclasses import replace
-from itertools import count
+from itertools import count, product
 
 import numpy as np
 import pytest
 
 from tint_sumo.scenes import T_INTERSECTION, find_scene
-from tint_sumo.scenes.geometry import POSE
+from tint_sumo.scenes.geometry import POSE, pose_distance_m
 from tint_sumo.scenes.layout import layout
 from tint_sumo.simulation.ego import (
     Collision,
@@ -250,15 +250,31 @@ def test_an_ego_looks_around_and_remembers_the_first_collision() -> None:
 
 
 def test_vehicles_are_followed_from_so_far_that_closing_is_known() -> None:
+    """A metre before they are close enough to count, and a step later they are not yet."""
+    egos, slots = Egos(1, layout(T)), Slots(1, layout(T))
+    seen_m = []
+    for ego_m in (19.1, 24.0, 28.0, 33.0):
+        egos.front_m[0] = ego_m
+        egos.drive(np.array([0.0]))
+        for route, front_m in product((0, 1), np.arange(5.5, 45.0, 0.5)):
+            slots.take(0, 0, route, front_m, member=0, number=0)
+            egos.look_around(slots)
+            distance_m = pose_distance_m(egos.pose[0], slots.pose[0, 0], 5.0, 2.0, 5.0, 2.0)
+            if distance_m < 2.0:
+                assert egos.distance_m[0, 0] == pytest.approx(distance_m)
+                seen_m.append(distance_m)
+    assert sum(distance_m > 1.0 for distance_m in seen_m) > 20
+
+
+def test_a_vehicle_that_has_just_appeared_was_infinitely_far() -> None:
     egos, slots = Egos(1, layout(T)), Slots(1, layout(T))
     egos.begin(0)
-    egos.front_m[0] = 10.0
+    egos.look_around(slots)
+    egos.front_m[0] = 19.1  # 0.9 m short of the lower lane, whose vehicles are 2 m wide and drive in its middle
     egos.drive(np.array([0.0]))
     slots.take(0, 0, 0, 22.5, member=0, number=0)
     egos.look_around(slots)
-    assert np.isinf(egos.distance_m[0, 0])
-    egos.front_m[0] = 19.1  # 0.9 m short of the lower lane, whose vehicles are 2 m wide and drive in its middle
-    egos.drive(np.array([0.0]))
-    egos.look_around(slots)
     assert egos.distance_m[0, 0] == pytest.approx(1.9, abs=0.01)
     assert np.isinf(egos._was_distance_m[0, 0])
+    egos.look_around(slots)
+    assert egos._was_distance_m[0, 0] == egos.distance_m[0, 0]

@@ -200,20 +200,6 @@ def test_position_noise_has_its_standard_deviation_and_spares_the_ego() -> None:
         noisy.close()
 
 
-def test_position_noise_is_drawn_anew_in_every_episode_and_environment() -> None:
-    clear, noisy = (SceneVectorEnv(2, position_noise_m=noise_m) for noise_m in (0.0, 0.2))
-    drawn: list[np.ndarray] = []
-    try:
-        for seed in (1, 5):
-            (exact, _), (measured, _) = (vector.reset(seed=seed) for vector in (clear, noisy))
-            drawn += [(measured["vehicles"] - exact["vehicles"])[index, 0] for index in range(2)]
-            assert exact["mask"][:, 0].all()
-    finally:
-        clear.close()
-        noisy.close()
-    assert len(np.unique(np.round(drawn, 6), axis=0)) == 4
-
-
 @pytest.mark.parametrize("preset", ["paper", "authors"])
 def test_rewards_and_outcomes(preset: str) -> None:
     env = SceneEnv(p_conservative=0.6, reward=preset, time_limit_s=15.0)

@@ -91,12 +91,12 @@ class Slots:
         follow(
             index,
             lane_pos_m,
-            self.route.reshape(-1),
+            self.route.ravel(),
             layout.lane_start_m,
             layout.ways,
             layout.scene.vehicle.length_m,
-            self.stage.reshape(-1),
-            self._lane_pos_m.reshape(-1),
-            self.front_m.reshape(-1),
-            self.pose.reshape(-1),
+            self.stage.ravel(),
+            self._lane_pos_m.ravel(),
+            self.front_m.ravel(),
+            self.pose.ravel(),
         )

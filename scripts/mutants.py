@@ -9,8 +9,9 @@ Cosmic Ray makes the mutants and keeps their results in runs/mutants, so that an
 ends a call after some time. A module that has changed begins anew. --again tries the survivors once more, after tests
 have been written. Mutants that do the same as the code are in tests/mutants.toml, with the reason, and do not count.
 
-Works in a copy of the repository, which changes of yours do not reach until the next call. Compiled functions run as
-Python, so that no mutant has to be compiled. Tests run in processes that are forked off after all packages are loaded.
+Works in a copy of the repository, which changes of yours do not reach until the next call. Where a module has compiled
+functions, all of them run as Python, so that no mutant has to be compiled. Tests run in processes that are forked off
+after all packages are loaded.
 """
 
 import argparse
@@ -31,6 +32,7 @@ from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
 
+import numba
 import pytest
 from cosmic_ray.commands import init
 from cosmic_ray.mutating import use_mutation
@@ -82,7 +84,7 @@ class Tally:
 def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parse(argv)
     end_s = time.monotonic() + (arguments.seconds or 1e9)
-    os.environ["NUMBA_DISABLE_JIT"] = "1"
+    os.environ["NUMBA_CACHE_DIR"] = str(WORK / "numba")
     sys.dont_write_bytecode = True  # a mutant may have the size and the time of the code before it
     tree = _copy_tree(WORK / "tree")
     os.chdir(tree)
@@ -112,7 +114,7 @@ def _copy_tree(tree: Path) -> Path:
     for name in subprocess.run(listed, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines():
         if (ROOT / name).is_file():
             (tree / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / name, tree / name)
+            shutil.copy2(ROOT / name, tree / name)  # Numba knows files by their times
     return tree
 
 
@@ -131,6 +133,7 @@ def _break_module(name: str, tree: Path, arguments: argparse.Namespace, end_s: f
             results = {job: one for job, one in results.items() if one.test_outcome == TestOutcome.KILLED}
         waiting = [one for one in chosen if one.job_id not in results]
         if waiting and time.monotonic() < end_s:
+            numba.config.DISABLE_JIT = "@compiled" in source  # type: ignore[attr-defined]
             limit_s = SLOWEST_S + 3.0 * _prepare(tests)
             for number, item in enumerate(waiting):
                 if time.monotonic() > end_s:

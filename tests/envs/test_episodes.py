@@ -17,6 +17,7 @@ from tint_sumo.envs.episodes import (
     episode_seed,
     observation_space,
     require_actions,
+    require_arguments,
 )
 from tint_sumo.envs.rows import NOBODY
 from tint_sumo.errors import InputError
@@ -47,11 +48,16 @@ def test_without_settings_the_scene_is_as_it_is() -> None:
         ({"p_conservative": 0.9}, "traffic", replace(T.traffic, p_conservative=0.9)),
         ({"p_conservative": 0.0}, "traffic", replace(T.traffic, p_conservative=0.0)),
         ({"time_limit_s": 3.0}, "time_limit_s", 3.0),
+        ({"max_episode_steps": 30}, "time_limit_s", pytest.approx(3.0)),
+        ({"max_episode_steps": 30, "decision_s": 0.4}, "time_limit_s", pytest.approx(12.0)),
+        ({"max_episode_steps": 30, "time_limit_s": 2.0}, "time_limit_s", 2.0),
         ({"tau_s": 1.5}, "population", replace(T.population, idm=replace(T.population.idm, tau_s=1.5))),
     ],
 )
 def test_a_setting_stands_in_place_of_the_scene_s_own(settings: dict[str, Any], field: str, value: object) -> None:
-    assert TaskSettings(**settings).played == replace(T, **{field: value})
+    found = TaskSettings(**settings).played
+    assert getattr(found, field) == value
+    assert replace(found, **{field: getattr(T, field)}) == T
 
 
 @pytest.mark.parametrize(
@@ -98,6 +104,16 @@ def test_spaces_are_of_the_scene() -> None:
     assert {name: part.shape for name, part in space.items()} == {"ego": (4,), "vehicles": (5, 2), "mask": (5,)}
     limits = {name: (part.low.min(), part.high.max()) for name, part in space.items()}  # type: ignore[attr-defined]
     assert limits == {"ego": (-2.0, 2.0), "vehicles": (-2.0, 2.0), "mask": (0.0, 1.0)}
+
+
+def test_arguments_are_those_of_the_environment_and_of_the_task() -> None:
+    class Environment:
+        def __init__(self, scene: str, *, render_mode: str | None = None, **task: Any) -> None: ...
+
+    require_arguments(Environment, {"scene": "four_way", "render_mode": None, "tau_s": 1.0, "backend": "auto"})
+    for name in ("task", "self", "tau"):
+        with pytest.raises(InputError, match=name):
+            require_arguments(Environment, {name: 1.0})
 
 
 @pytest.mark.parametrize("actions", [[0, 3], [-1, 0], [0], [0, 1, 2], [[0, 1]], [3, 3]])

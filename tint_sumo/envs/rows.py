@@ -54,7 +54,7 @@ _OUTCOME_NAMES = np.array(["", *OUTCOMES], object)  # by their numbers in rows
 
 def outcome_name(code: int) -> str:
     """Return the name of a row's outcome; empty while the episode goes on."""
-    return str(_OUTCOME_NAMES[code])
+    return OUTCOMES[code - 1] if code else ""
 
 
 def outcome_names(codes: NDArray[np.int64]) -> NDArray[np.object_]:
@@ -62,8 +62,8 @@ def outcome_names(codes: NDArray[np.int64]) -> NDArray[np.object_]:
     return _OUTCOME_NAMES[codes]
 
 
-def fields_of(row: np.void) -> dict[str, Any]:
-    """Return a row's fields as Python's numbers and views of the row's arrays."""
+def fields_of(row: np.void | Rows) -> dict[str, Any]:
+    """Return the fields of a row, or of the only one of some rows, as Python's numbers and views of the arrays."""
     return dict(zip(row.dtype.names or (), row.item(), strict=True))
 
 
@@ -82,12 +82,12 @@ def step_info(fields: Mapping[str, Any], slot_infos: Sequence[str], collision: d
     """Return the info of an environment after a step; ``collision`` is empty without one."""
     info = start_info(fields, slot_infos)
     info["reward_terms"] = {term: fields[term] for term in REWARD_TERMS}
-    return info | end_info(info["outcome"], collision)
+    return info | end_info(info["outcome"], collision) if info["outcome"] else info
 
 
 def end_info(outcome: str, collision: dict[str, Any]) -> dict[str, Any]:
-    """Return what a step's info holds only where an episode has ended with this outcome; nothing without one."""
-    ending: dict[str, Any] = {"is_success": outcome == "success"} if outcome else {}
+    """Return what a step's info holds only where an episode has ended; ``collision`` is empty without one."""
+    ending = {"is_success": outcome == "success"}
     return {**ending, "collision": collision} if collision else ending
 
 

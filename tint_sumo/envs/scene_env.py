@@ -14,7 +14,7 @@ from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.calls import Phase, checked_actions, checked_seed, require_episode, require_open
 from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_arguments
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, require_render_mode
-from tint_sumo.envs.rows import Observation, fields_of, observation_of, start_info, step_info
+from tint_sumo.envs.rows import OBSERVATION_KEYS, Observation, fields_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
 from tint_sumo.simulation.own import OwnSimulation
@@ -199,7 +199,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._step(actions)
         self._phase = Phase.READY
         self._show()
-        fields = fields_of(self._episodes.rows[0])
+        fields = fields_of(self._episodes.rows)
         info = step_info(fields, self._slot_infos, self._episodes.collision_info(0))
         return _observation(fields), fields["reward"], fields["terminated"], fields["truncated"], info
 
@@ -235,7 +235,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     def _shown(self) -> tuple[Observation, dict[str, Any]]:
         """The observation and info where the episode is."""
-        fields = fields_of(self._episodes.rows[0])
+        fields = fields_of(self._episodes.rows)
         return _observation(fields), start_info(fields, self._slot_infos)
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -279,4 +279,4 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
 
 def _observation(fields: dict[str, Any]) -> Observation:
-    return {key: array.copy() for key, array in observation_of(fields).items()}
+    return {key: fields[key].copy() for key in OBSERVATION_KEYS}

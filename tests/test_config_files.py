@@ -25,7 +25,7 @@ COMMAND_LINES = (
     "record --out data --windows 70 --p-conservative 0.2 0.8 --population continuous --format fcd --json",
     "record --out data --sumocfg mine.sumocfg",
     "record --out s3://bucket/data --executor ray --address ray://head:10001",
-    "dataset inspect data --figure picture.png",
+    "dataset inspect data --figure picture.png --verify",
     "traits train --data data --out model --method morton --budget paper --noise 0.1",
     "traits evaluate --data data --model vae --noise 1e-3 --other-scene",
     "traits plot --data data --model vae --out pictures",

@@ -259,18 +259,25 @@ class InspectDataset(Command):
     """Folder of a dataset."""
     figure: Path | None = None
     """Where a picture of the distributions goes: .png, .jpg, .webp, .svg or .pdf."""
+    verify: bool = False
+    """Compare all files with the checksums of the manifest first."""
 
     def run(self) -> Outcome:
         from tint_sumo.dataset.inspection import inspect, plot, report
+        from tint_sumo.dataset.schema import verify
+        from tint_sumo.dataset.windows import read_manifest
 
         if self.figure is not None:
             require_output_file(self.figure, PICTURE_SUFFIXES, "--figure")
+        verified = verify(self.data, read_manifest(self.data)) if self.verify else None
         found = inspect(self.data)
         text = report(found)
+        if verified is not None:
+            text += f"\nall {verified} files are as they were recorded"
         if self.figure is not None:
             plot(found, self.figure)
             text = "\n".join([text, *_wrote([str(self.figure)])])
-        return Outcome(text, {"data": str(self.data), **found.summary()})
+        return Outcome(text, {"data": str(self.data), "verified_files": verified, **found.summary()})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -162,7 +162,7 @@ def test_the_dataset_can_be_inspected(merge_data: Path, tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["--sumocfg", "nowhere.sumocfg"], "no file"),
-        (["--sumocfg", "{merge}", "--windows", "0"], "windows must be at least 1"),
+        (["--sumocfg", "{merge}", "--windows", "0"], "windows must lie in 1 to 100,000,000"),
         (["--sumocfg", "{merge}", "--p-conservative", "0.3"], "--p-conservative does not go with --sumocfg"),
         (["--sumocfg", "{merge}", "--format", "fcd"], "--format does not go with --sumocfg"),
         (["--sumocfg", "{empty}"], "nobody drives in the first 50 s"),

@@ -160,7 +160,7 @@ def test_recording_again_leaves_a_finished_dataset_alone(dataset: Path) -> None:
     [
         ({"windows": 0}, "windows must be at least 1"),
         ({"windows": 10, "p_conservative": 2.0}, r"must be a probability in \[0, 1\]"),
-        ({"windows": 10, "workers": 0}, "workers must be at least 1"),
+        ({"windows": 10, "workers": 0}, "workers must lie in 1 to 1,024"),
         ({"windows": 10, "seed": -1}, "seed must not be negative"),
         ({"windows": 10, "scene": "moon"}, "unknown scene 'moon'"),
     ],

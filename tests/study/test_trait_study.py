@@ -80,7 +80,7 @@ def test_another_study_leaves_the_folder_alone(finished: Path) -> None:
 def test_bad_studies_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="unknown trait method 'magic'"):
         run_trait_study(replace(SMALL, methods=("magic",)), tmp_path / "out")
-    with pytest.raises(InputError, match="workers must be at least 1"):
+    with pytest.raises(InputError, match="workers must lie in 1 to 1,024"):
         run_trait_study(SMALL, tmp_path / "out", workers=0)
     with pytest.raises(InputError, match="no results in"):
         write_trait_report(tmp_path)

@@ -5,11 +5,13 @@ driver, with the trait label), each one Parquet file per shard, and ``manifest.j
 for, tells the trajectories once more, as SUMO does.
 """
 
+import hashlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -99,7 +101,44 @@ def read_shard(file: Path, columns: list[str] | None = None) -> pd.DataFrame:
         InputError: the file is missing or damaged.
     """
     with _mendable(file):
-        return pd.read_parquet(file, columns=columns)
+        rows = pd.read_parquet(file, columns=columns)
+    _require_numbers(file, rows)
+    return rows
+
+
+def _require_numbers(file: Path, rows: pd.DataFrame) -> None:
+    """Raise InputError if a column holds no numbers where it must, or a number that is not finite."""
+    for field in (*TRAJECTORY_SCHEMA, *DRIVER_SCHEMA):
+        if field.name not in rows.columns or not (pa.types.is_floating(field.type) or pa.types.is_integer(field.type)):
+            continue
+        column = rows[field.name]
+        if not pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column):
+            raise InputError(f"{file} has other values than numbers in {field.name}; record the dataset anew")
+        values = column.to_numpy(np.float64, na_value=np.nan)
+        if np.isinf(values).any() or (not field.nullable and np.isnan(values).any()):
+            raise InputError(f"{file} has values in {field.name} that are not finite; record the dataset anew")
+
+
+def verify(folder: Path, manifest: Mapping[str, Any]) -> int:
+    """Compare the files of a dataset with the checksums in its manifest.
+
+    Returns:
+        The number of files.
+
+    Raises:
+        InputError: a file is missing or another one, or the manifest has no checksums.
+    """
+    checksums = manifest.get("sha256")
+    if not checksums:
+        raise InputError(f"{folder / MANIFEST} has no checksums (an earlier version recorded it); record it anew")
+    for shard in range(manifest["shards"]):
+        for table in TABLES:
+            file = shard_file(folder, table, shard)
+            with _mendable(file), file.open("rb") as content:
+                digest = hashlib.file_digest(content, "sha256").hexdigest()
+            if checksums.get(shard_path(table, shard)) != digest:
+                raise InputError(f"{file} is not as it was recorded; remove it and repeat the command that recorded it")
+    return len(TABLES) * int(manifest["shards"])
 
 
 def read_shard_metadata(file: Path) -> pq.FileMetaData:

@@ -5,6 +5,7 @@ dataset does not depend on the number of workers, and an interrupted recording r
 than a shard per process is in memory at a time.
 """
 
+import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,6 +30,7 @@ from tint_sumo.dataset.schema import (
     read_shard_metadata,
     shard_file,
     shard_number,
+    shard_path,
 )
 from tint_sumo.errors import InputError
 from tint_sumo.executors import Executor, Work, Workers, executor_of
@@ -101,6 +103,7 @@ def record_dataset(
         manifest = {
             **settings,
             **_contents(found),
+            "sha256": _checksums(store, len(found)),
             "windows_asked_for": settings["windows"],
             "episodes": len(found) * episodes_per_shard,
             "episode_s": episode_s,
@@ -178,6 +181,12 @@ def _contents(shards: Sequence[ShardContents]) -> dict[str, Any]:
         "shards": len(shards),
         "versions": versions(("tint_sumo", "libsumo", "numpy", "pandas", "pyarrow")),
     }
+
+
+def _checksums(store: Store, shards: int) -> dict[str, str]:
+    """Checksums of all tables' files, by their paths in the dataset's folder."""
+    paths = [shard_path(table, shard) for table in TABLES for shard in range(shards)]
+    return {path: hashlib.sha256(store.read(path)).hexdigest() for path in paths}
 
 
 def has_tables(out: Path, shard: int) -> bool:

@@ -3,29 +3,29 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Annotated, Any, Protocol, Self
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, WINDOW_STEPS, Population, read_population
+from tint_sumo.config import (
+    MIN_WINDOW_STEPS,
+    NO_LEADER_GAP_M,
+    WINDOW_STEPS,
+    Population,
+    Share,
+    TrafficSeed,
+    read_population,
+)
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, SCHEMA_VERSION, TRAJECTORIES, read_shards
 from tint_sumo.errors import InputError
 from tint_sumo.files import read_json
+from tint_sumo.ranges import Range
+from tint_sumo.structures import FieldError, build
 
 _DRIVERS_PER_EPISODE = 100_000
-_MANIFEST_KEYS = (
-    "rows",
-    "drivers",
-    "windows",
-    "shards",
-    "seed",
-    "scene",
-    "scene_digest",
-    "p_conservative",
-    "population",
-)
+_Count = Annotated[int, Range(0, 10**12)]
 PART = 10_000  # windows that are worked on at a time
 
 
@@ -212,6 +212,22 @@ def episodes_to_test(episode: NDArray[np.int64], test_fraction: float, seed: int
     return np.random.default_rng(seed).permutation(episodes)[: round(test_fraction * len(episodes))]
 
 
+@dataclass(frozen=True)
+class _Manifest:
+    """What a manifest must say; it says more, of which nothing is computed."""
+
+    rows: _Count
+    drivers: _Count
+    windows: _Count
+    shards: Annotated[int, Range(0, 1_000_000)]
+    seed: TrafficSeed
+    scene: str
+    scene_digest: str
+    p_conservative: Share | None
+    population: Any
+    sha256: dict[str, str] | None = None
+
+
 def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of a dataset.
 
@@ -224,9 +240,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise InputError(
             f"{folder} has dataset schema version {found}, this tint_sumo reads {SCHEMA_VERSION}; record it anew"
         )
-    missing = [key for key in _MANIFEST_KEYS if key not in manifest]
-    if missing:
-        raise InputError(f"{folder / MANIFEST} is damaged (no {', '.join(missing)}); record the dataset anew")
+    try:
+        build(_Manifest, {field.name: manifest[field.name] for field in fields(_Manifest) if field.name in manifest})
+    except FieldError as error:
+        raise InputError(f"{folder / MANIFEST} is damaged ({error}); record the dataset anew") from None
     return manifest
 
 

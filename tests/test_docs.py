@@ -4,8 +4,10 @@ import os
 import re
 import subprocess
 import sys
+from datetime import date
 from pathlib import Path
 
+import pandas
 import pytest
 
 from tests.documents import blocks
@@ -151,6 +153,45 @@ def test_the_tables_of_the_study_say_what_the_csv_file_says() -> None:
         (line,) = [line for line in text.split("## ")[-1].splitlines() if line.startswith(f"| {title} |")]
         assert [cell for cell in line.strip("| ").split(" | ")[1:] if cell != "-"] == cells
     assert f"| ceiling | | {' | '.join(percent(share) for share in ceilings.values())} |" in text
+
+
+def test_the_yield_rule_s_page_has_the_study_s_rates() -> None:
+    rows, _ = read_csv(RESULTS / "navigation.csv")
+    own = {row.conditions.p_conservative: row for row in at_mixes(rows) if row.method == "always_go"}
+    cells = [" / ".join(percent(own[p].rate(outcome)) for outcome in OUTCOMES) for p in (0.25, 0.4, 0.6)]
+    assert f"| `TIntersection-v1` | {' | '.join(cells)} |" in (DOCS / "explanation" / "yield-rule.md").read_text()
+
+
+def test_differences_that_are_told_are_those_of_the_study() -> None:
+    text = (RESULTS / "navigation.md").read_text(encoding="utf-8")
+    told = re.findall(r"\+[\d.]+ \[[^]]+\]", (DOCS / "explanation" / "when-traits-help.md").read_text(encoding="utf-8"))
+    assert len(told) == 2
+    for method, difference in zip(("cross-window", "oracle"), told, strict=True):
+        (line,) = [line for line in text.splitlines() if re.match(rf"\| {method} +\| no labels ", line)]
+        assert difference == line.split("|")[4].strip()
+
+
+def test_the_table_of_trait_models_has_the_study_s_accuracies() -> None:
+    table = pandas.read_csv(RESULTS / "traits.csv").set_index(["method", "noise_m"])
+    head, _, *lines = next(
+        one for one in _tables(DOCS / "explanation" / "trait-models.md") if "| noise |" in one
+    ).split("\n")[:-1]
+    methods = re.findall("`(.*?)`", head)
+    assert len(methods) == 4 and len(lines) == 4
+    for line in lines:
+        noise, *cells = line.strip("| ").split(" | ")
+        for method, cell in zip(methods, cells, strict=True):
+            row = table.loc[(method, 0.0 if noise == "none" else float(noise.removesuffix(" m")))]
+            digits = len(cell.split(" ")[0].split(".")[1])
+            assert cell == f"{percent(row['svc_percent'] / 100, digits)} ± {row['svc_percent_sd']:.{digits}f}"
+
+
+def test_what_was_measured_once_stands_where_the_list_of_it_says() -> None:
+    listed = pandas.read_csv(RESULTS / "once.csv")
+    assert not listed.isna().any(axis=None)
+    for one in listed.itertuples():
+        assert str(one.shown) in (ROOT / str(one.page)).read_text(encoding="utf-8"), one
+        date.fromisoformat(str(one.published))
 
 
 def _tables(page: Path) -> list[str]:

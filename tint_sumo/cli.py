@@ -103,6 +103,8 @@ class SpreadCommand(Command):
                     raise InputError(f"--{flag} goes with --executor ray; add that, or leave it out")
             yield workers
             return
+        if workers != getattr(type(self), "workers", workers):  # a command without that flag uses no processes
+            raise InputError("--workers goes with --executor local; a cluster does as many jobs as it has room for")
         try:
             from tint_sumo.executors.cluster import ray_cluster
         except ModuleNotFoundError as error:
@@ -294,8 +296,9 @@ class TrainTraits(Command):
     """vae (the paper's), cross_window and morton learn without labels, classifier with them."""
     budget: TraitBudgetValue = "quick"
     """quick: for about 30,000 windows; full: for some 700,000; paper: the paper's network and 1000 epochs."""
-    noise: NoiseM = 0.0
-    """Standard deviation of the noise on every position in training, m."""
+    noise: NoiseM | None = None
+    """Standard deviation of the noise on every position in training, m; that of the budget, 0 in all that have names,
+    if not given."""
     seed: Seed = 0
     """Seed of the training, and of the split into training and test episodes."""
     streaming: bool = False
@@ -304,11 +307,14 @@ class TrainTraits(Command):
     def run(self) -> Outcome:
         from tint_sumo.job_table import one_job
         from tint_sumo.standings import Title
-        from tint_sumo.study.trait_models import require_noise, train_traits
+        from tint_sumo.study.trait_models import require_used, train_traits
 
-        _use_one_thread()
-        require_noise(self.noise)
-        settings = replace(_TRAIT_BUDGET.full(self.budget), noise_m=self.noise)
+        settings = _TRAIT_BUDGET.full(self.budget)
+        if self.noise is not None:
+            if settings.noise_m not in (0.0, self.noise):
+                raise InputError(f"noise is {self.noise:g} m, and {settings.noise_m:g} m in the budget; give it once")
+            settings = replace(settings, noise_m=self.noise)
+        require_used(self.method, settings)
         with one_job(Title("traits", self.method, seed=self.seed)) as report:
             card = train_traits(
                 self.data,

@@ -412,3 +412,5 @@ def test_ray_is_needed_for_its_executor_alone(
     assert 'pip install "tint_sumo[ray]"' in capsys.readouterr().err
     assert main(["record", "--out", "x", "--address", "ray://head:10001"]) == 2
     assert "--address goes with --executor ray" in capsys.readouterr().err
+    assert main(["record", "--out", "x", "--executor", "ray", "--workers", "4"]) == 2
+    assert "--workers goes with --executor local" in capsys.readouterr().err

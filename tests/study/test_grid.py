@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tint_sumo.config import Idm, PpoSettings, TraitSettings
+from tint_sumo.config import Idm, PolicySettings, PpoSettings, TraitSettings
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import find_scene
 from tint_sumo.study import budgets, grid, policy_jobs
@@ -17,7 +17,9 @@ from tint_sumo.study.loading import load_policy
 from tint_sumo.study.methods import Learned, find_method
 from tint_sumo.study.policy_jobs import TrainJob
 from tint_sumo.study.results import read_results
+from tint_sumo.study.sweep import Sweep
 from tint_sumo.study.trait_job import TraitJob
+from tint_sumo.study.trait_study import TraitStudy
 
 POLICIES = ("oracle-P0.4-seed0", "ma-P0.4-seed0")
 AT_MIX, HALF, ELSEWHERE = Conditions(0.4), Conditions(0.4, percent=50), Conditions(0.9)
@@ -160,9 +162,22 @@ def test_traits_are_learnt_first_where_the_budget_learns_them_and_nowhere_else(t
     assert [job.name for job in jobs if isinstance(job, TraitJob)] == ["traits classifier"] == [jobs[0].name]
     every = plan(replace(budget, methods=("vae", "no_attention", "streaming", "oracle", "ma")), tmp_path)
     assert [job.method for job in every if isinstance(job, TraitJob)] == ["vae", "cross_window", "classifier"]
-    given = plan(replace(budget, traits=None), tmp_path)
+    given = plan(replace(budget, traits=None, windows=0), tmp_path)
     assert not [job for job in given if isinstance(job, TraitJob)]
     assert not [need for job in given for need in job.needs if need.startswith("traits")]
+
+
+def test_a_study_refuses_settings_that_none_of_its_stages_uses(tmp_path: Path) -> None:
+    no_attention = replace(BUDGETS["quick"].ppo, policy=PolicySettings(attention=False))
+    with pytest.raises(InputError, match=r"attention is part of the method, and no_labels has it"):
+        plan(replace(BUDGETS["quick"], ppo=no_attention), tmp_path)
+    for unused in ({"windows": 100}, {"record_p_conservative": 0.4}):
+        with pytest.raises(InputError, match="windows are recorded to learn traits from"):
+            replace(BUDGETS["full"], **unused)
+    with pytest.raises(InputError, match=r"settings\.noise_m has no use"):
+        TraitStudy(settings=replace(TraitSettings(), noise_m=0.1))
+    with pytest.raises(InputError, match="oracle has it"):
+        Sweep(no_attention, {"n_epochs": [1, 2]})
 
 
 def test_ma_needs_the_oracle_s_training_with_the_same_seed_and_mix(tmp_path: Path, budget: Budget) -> None:

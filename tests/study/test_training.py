@@ -24,7 +24,7 @@ from tests.simulation.scenes import T
 from tests.study import runs
 from tint_sumo import traits
 from tint_sumo.checkpoints import CHECKPOINT_FILE, PICKLES
-from tint_sumo.config import PpoSettings, TraitSettings
+from tint_sumo.config import PolicySettings, PpoSettings, TraitSettings
 from tint_sumo.determinism import preserved_random_state
 from tint_sumo.errors import DivergedError, InputError
 from tint_sumo.policy import ClassifierTraits, EncoderTraits, OracleTraits, RecurrentPPO, StreamingTraits
@@ -445,6 +445,26 @@ def test_bad_values_leave_no_folder(
 ) -> None:
     with pytest.raises(InputError, match=message):
         train_policy(method, p_conservative, steps, seed, tmp_path / "run", settings=tiny)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "given", "message"),
+    [
+        ("oracle", {"traits": "vae"}, "method oracle infers no traits; leave the trait model"),
+        ("no_labels", {"other_scene": True}, "method no_labels infers no traits"),
+        (
+            "vae",
+            {"settings": PpoSettings(policy=PolicySettings(attention=False))},
+            "leave policy.attention out",
+        ),
+    ],
+)
+def test_what_a_method_has_no_use_for_is_refused(
+    tmp_path: Path, tiny: PpoSettings, method: str, given: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        train_policy(method, 0.4, 64, 0, tmp_path / "run", **{"settings": tiny, **given})
     assert not (tmp_path / "run").exists()
 
 

@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 from typing import Any
 
@@ -5,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.simulation.scenes import T
+from tint_sumo.cli import main
 from tint_sumo.config import CONSERVATIVE_LABEL, TraitSettings
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_labels, load_windows, split_by_episode
@@ -134,6 +136,25 @@ def test_every_method_trains_on_a_dataset_and_reports_its_errors(dataset: Path, 
     found = evaluate_traits(dataset, tmp_path)
     assert 0.4 < found["accuracy"] <= 1.0
     assert (found["error_m"] is None) == (method == "classifier")
+
+
+def test_every_setting_of_a_training_is_used_or_refused(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def train(budget: dict[str, Any], *flags: str) -> int:
+        (tmp_path / "train.yaml").write_text(json.dumps({"data": str(dataset), "budget": {"epochs": 1, **budget}}))
+        return main(
+            ["traits", "train", "--config", str(tmp_path / "train.yaml"), "--out", str(tmp_path / "run"), *flags]
+        )
+
+    assert train({"noise_m": 0.5}, "--noise", "0.1") == 2
+    assert "noise is 0.1 m, and 0.5 m in the budget; give it once" in capsys.readouterr().err
+    assert train({"kl_weight": 1.0}, "--method", "cross_window") == 2
+    assert "method cross_window does not use kl_weight" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+    assert train({"noise_m": 0.5, "kl_weight": 1.0}) == 0
+    settings = read_card(tmp_path / "run")["settings"]
+    assert (settings["noise_m"], settings["kl_weight"]) == (0.5, 1.0)
 
 
 def test_a_negative_seed_is_refused(dataset: Path, tmp_path: Path) -> None:

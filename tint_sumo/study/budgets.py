@@ -108,6 +108,11 @@ class Budget:
         require_ranges(self)
         if self.traits is not None and self.windows == 0:
             raise InputError("windows must be at least 1, not 0")
+        if self.traits is None and (self.windows, self.record_p_conservative) != (0, Budget.record_p_conservative):
+            raise InputError(
+                "windows are recorded to learn traits from; give traits, or windows: 0 and "
+                f"record_p_conservative: {Budget.record_p_conservative:g}"
+            )
 
 
 # A small network is as accurate here as the paper's, trains in minutes and encodes 768 windows in less than 2 ms.

@@ -24,6 +24,8 @@ def plan(budget: Budget, out: Path, scene: str | Scene = T_INTERSECTION) -> list
     learned = [name for name in budget.methods if isinstance(find_method(name), Learned)]
     rules = [name for name in budget.methods if name not in learned]
     trained = with_shared_trainings(learned)
+    for name in trained:
+        find_learned(name).settings_of(budget.ppo)  # refuses what does not fit before hours of work
     encoders = dict.fromkeys(filter(None, (find_learned(name).encoder for name in trained)))
     traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
     given = rules + (shipped_policies() if budget.with_shipped and scene == T_INTERSECTION else [])

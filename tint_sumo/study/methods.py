@@ -1,12 +1,13 @@
 """The methods of the study. A new one is one entry here (and its rule or trait source)."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tint_sumo.config import PpoSettings
 from tint_sumo.errors import InputError, find_named, refuse_old_name
 from tint_sumo.policy.trait_sources import (
     ClassifierTraits,
@@ -78,6 +79,19 @@ class Learned:
     def make_source(self, encoder: TraitModel | None) -> TraitSource:
         """A new source of traits."""
         return self.source() if encoder is None else self.source(encoder)
+
+    def settings_of(self, settings: PpoSettings) -> PpoSettings:
+        """Return settings of PPO with the network of this method.
+
+        Raises:
+            InputError: they leave out the attention, which this method has.
+        """
+        if self.attention and not settings.policy.attention:
+            raise InputError(
+                f"whether there is attention is part of the method, and {self.name} has it; "
+                "leave policy.attention out, or choose the method no_attention"
+            )
+        return replace(settings, policy=replace(settings.policy, attention=self.attention))
 
 
 Method = Rule | Learned

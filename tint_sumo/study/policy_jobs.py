@@ -79,7 +79,8 @@ class TrainJob:
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
         method = find_learned(self.method)
-        traits = None if self.shipped_traits else self.out / trait_folder(str(method.encoder)) / "model.safetensors"
+        uses_own = method.encoder is not None and not self.shipped_traits
+        traits = self.out / trait_folder(str(method.encoder)) / "model.safetensors" if uses_own else None
         if method.trained_as is not None:
             share_training(self.out / self._folder(method.trained_as), self.method, self.folder, traits)
             return f"shares the training of {method.trained_as}"

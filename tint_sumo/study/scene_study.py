@@ -145,7 +145,7 @@ class TransferJob:
         torch.set_num_threads(THREADS_PER_JOB)
         scenes = self.study.scenes
         model, probe = self._train(report)
-        line = fit_line(model, *self._properties(self.trained_on, test=False))
+        line = fit_line(model, *self._properties(self.trained_on, test=False), noise_m=self.study.noise_m)
         rows, words = [], []
         for scene in scenes:
             accuracy = probe.score(*self._labelled((scene,), test=True)).accuracy

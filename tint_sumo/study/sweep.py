@@ -77,6 +77,8 @@ class Sweep:
             raise InputError("a sweep needs a setting to vary, such as learning_rate=0.001,0.003")
         if _ATTENTION in self.varied:
             raise InputError(f"{_ATTENTION} is part of the method; compare with the method no_attention instead")
+        for name in self.methods:
+            find_learned(name).settings_of(self.settings)
         require_fields(self.varied, dict.fromkeys(SETTINGS))
         for name, values in self.varied.items():
             if not values:

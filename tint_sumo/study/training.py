@@ -6,7 +6,7 @@ import io
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -105,11 +105,13 @@ def train_policy(
     require_seed(seed)
     if steps < 1:
         raise InputError(f"steps must be at least 1, not {steps}")
+    if learned.encoder is None and (traits is not None or other_scene):
+        raise InputError(f"method {method} infers no traits; leave the trait model and other_scene out")
     encoder = _load_encoder(learned, traits)
     place = described(scene)
     if encoder is not None and not other_scene:
         require_scene(traits or str(learned.encoder), place["scene"], place["scene_digest"], "the policy")
-    settings = replace(settings, policy=replace(settings.policy, attention=learned.attention))
+    settings = learned.settings_of(settings)
     identity = {
         "kind": "policy",
         "method": method,

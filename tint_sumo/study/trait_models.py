@@ -22,6 +22,7 @@ from tint_sumo.dataset.windows import (
 )
 from tint_sumo.errors import InputError
 from tint_sumo.progress import Report, silent
+from tint_sumo.study.budgets import TRAIT_BUDGETS
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
 from tint_sumo.traits.figures import plot_latents, plot_reconstructions
 from tint_sumo.traits.model import find_trait_method
@@ -192,6 +193,13 @@ def require_noise(noise_m: float) -> None:
     """Raise InputError unless ``noise_m`` can be a standard deviation."""
     if not 0.0 <= noise_m < float("inf"):
         raise InputError(f"noise is a standard deviation in m and must be 0 or more, not {noise_m}")
+
+
+def require_used(method: str, settings: TraitSettings) -> None:
+    """Raise InputError if settings that a method does not use are others than in all budgets that have names."""
+    for name in find_trait_method(method).unused_settings:
+        if getattr(settings, name) not in {getattr(one, name) for one in TRAIT_BUDGETS.values()}:
+            raise InputError(f"method {method} does not use {name}; leave it out of the budget")
 
 
 def describe(data: Path) -> dict[str, Any]:

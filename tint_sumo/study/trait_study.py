@@ -11,6 +11,7 @@ import torch
 from tint_sumo.config import Fraction, NoiseM, Seed, TraitSettings, WindowCount
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows, split_by_episode
+from tint_sumo.errors import InputError
 from tint_sumo.executors import Job, Workers, executor_of
 from tint_sumo.executors.jobs import THREADS_PER_JOB
 from tint_sumo.files import claim_folder, write_json
@@ -52,6 +53,8 @@ class TraitStudy:
 
     def __post_init__(self) -> None:
         require_ranges(self)
+        if self.settings.noise_m != 0.0:
+            raise InputError("settings.noise_m has no use, since every noise of noises_m is trained with; leave it out")
 
 
 TRAIT_STUDIES = {"full": TraitStudy()}

@@ -18,6 +18,7 @@ class Classifier(TraitModel):
 
     method = "classifier"
     uses_labels = True
+    unused_settings = ("kl_weight", "reconstruction_weight", "decoder_output_size")
 
     def __init__(self, settings: TraitSettings, latent_size: int = LATENT_SIZE) -> None:
         super().__init__(settings, latent_size)

@@ -34,6 +34,7 @@ class CrossWindow(TraitModel):
 
     method = "cross_window"
     uses_other_window = True
+    unused_settings = ("kl_weight", "reconstruction_weight")
 
     def __init__(self, settings: TraitSettings, latent_size: int = LATENT_SIZE) -> None:
         super().__init__(settings, latent_size)

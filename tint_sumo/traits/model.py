@@ -39,6 +39,7 @@ class TraitModel(nn.Module, ABC):
     undefined_steps: ClassVar[tuple[int, ...]] = (1, 0)  # leading steps at which each feature is unknown, and zero
     uses_other_window: ClassVar[bool] = False  # whether the loss takes another window of the same driver
     uses_labels: ClassVar[bool] = False  # whether the loss takes the true traits
+    unused_settings: ClassVar[tuple[str, ...]] = ()  # fields of TraitSettings that have no influence
 
     feature_mean: Tensor
     feature_scale: Tensor

@@ -60,6 +60,10 @@ def test_a_value_survives_the_way_to_a_file_and_back() -> None:
         ({"name": "x", "part": {"file": 3}}, "part.file: must be a path or null, not 3"),
         ({"name": "x", "sizes": {"a": 1.5}}, "sizes.a: must be a whole number, not 1.5"),
         ({"name": 1, "on": 1, "part": {"kind": "c"}}, "name: must be text, not 1; also wrong: part.kind, on"),
+        (
+            {"name": "x", "part": {"seeds": [1, "2", "3"]}, "on": 1},
+            "part.seeds[1]: must be a whole number, not '2'; also wrong: part.seeds[2], on",
+        ),
         ({"name": ["long" * 1000]}, "name: must be text, not ['longlong"),
     ],
 )

@@ -35,12 +35,14 @@ _MOST_OTHERS = 5  # further errors that a message names
 
 
 class FieldError(InputError):
-    """A value that does not fit; ``where`` it is and what is wrong with it."""
+    """A value that does not fit: ``where`` it is, what is wrong with it, and where ``others`` are."""
 
-    def __init__(self, where: Where, problem: str) -> None:
-        super().__init__(f"{dotted(where)}: {problem}" if where else problem)
+    def __init__(self, where: Where, problem: str, others: Sequence[Where] = ()) -> None:
+        also = f"; also wrong: {', '.join(map(dotted, others[:_MOST_OTHERS]))}" if others else ""
+        super().__init__((f"{dotted(where)}: {problem}" if where else problem) + also)
         self.where = where
         self.problem = problem
+        self.others = others
 
 
 def dotted(where: Where) -> str:
@@ -224,6 +226,8 @@ def _field_error(kind: Any, errors: Iterable[Mapping[str, Any]], where: Where) -
             found.setdefault(place, _unknown(str(place[-1]), _names(_find(kind, error["loc"][1:-1])[1])))
         elif isinstance(problem, FieldError):
             found.setdefault((*place, *problem.where), problem.problem)
+            for other in problem.others:
+                found.setdefault((*place, *other), "")
         elif error["type"] in ("value_error", "json_invalid"):
             found.setdefault(place, str(problem))
         else:
@@ -234,8 +238,7 @@ def _field_error(kind: Any, errors: Iterable[Mapping[str, Any]], where: Where) -
     found |= {place: f"{', '.join(names)} must be given" for place, names in missing.items()}
     found |= {at: text for at, text in of_unions.items() if not any(one[: len(at)] == at for one in found)}
     (first, problem), *others = found.items()
-    also = ", ".join(dotted((*where, *place)) for place, _ in others[:_MOST_OTHERS])
-    return FieldError((*where, *first), problem + (f"; also wrong: {also}" if also else ""))
+    return FieldError((*where, *first), problem, [(*where, *place) for place, _ in others])
 
 
 def _find(kind: Any, location: Sequence[str | int]) -> tuple[Where, Any, Where | None]:

@@ -103,8 +103,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
       controller and its safety check work; `reward` and `reward_terms` are their sums, and everything else is as after
       the last of them. Default: one step of the simulation. Policies with traits look at every step of the simulation;
       they take `tint_sumo.policy.ActionRepeat` instead, which tells how it differs.
-    * `backend`: `"libsumo"`, `"traci"` (a sumo subprocess), or `"auto"` (default): libsumo if no other environment of
-      this process uses it, since libsumo holds one simulation per process.
+    * `backend`: `"libsumo"`, `"traci"` (a sumo subprocess), or `"auto"` (default): libsumo if neither another
+      environment nor your own program uses it in this process, since libsumo holds one simulation per process.
     * `render_mode`: `None`, `"rgb_array"`, or `"human"`: a window follows the episodes in real time. It needs a
       display and a Python with tkinter; if you close it, the episodes go on without it. The wrapper
       `gymnasium.wrappers.RecordVideo` takes `"rgb_array"`, and moviepy: `pip install "tint_sumo[video]"`.

@@ -214,7 +214,6 @@ class Episodes:
             before = self.rows.copy()
             any_ended |= self._step(np.where(over, 0.0, desired_mps))
             add_up(before, self.rows)
-            self.steps[over] -= 1
         return any_ended
 
     def _step(self, desired_mps: Floats) -> bool:

@@ -54,8 +54,8 @@ def test_a_value_survives_the_way_to_a_file_and_back() -> None:
             "part.mix: must be a number from 0 to 1 or a list of 2, each item a number from 0 to 1, not 'x'",
         ),
         ({"name": "x", "part": {"mix": [0.1]}}, "part.mix: must be a number from 0 to 1 or a list of 2, each item"),
-        ({"name": "x", "part": {"mix": 2}}, "part.mix: must be from 0 to 1, not 2.0"),
-        ({"name": "x", "part": {"mix": [0.1, 7]}}, "part.mix[1]: must be from 0 to 1, not 7.0"),
+        ({"name": "x", "part": {"mix": 2}}, "part.mix: must lie in 0 to 1, not 2.0"),
+        ({"name": "x", "part": {"mix": [0.1, 7]}}, "part.mix[1]: must lie in 0 to 1, not 7.0"),
         ({"name": "x", "part": {"mix": float("nan")}}, "part.mix: must be a number from 0 to 1 or a list of 2"),
         ({"name": "x", "part": {"file": 3}}, "part.file: must be a path or null, not 3"),
         ({"name": "x", "sizes": {"a": 1.5}}, "sizes.a: must be a whole number, not 1.5"),
@@ -85,7 +85,7 @@ def test_damaged_json_is_refused(text: bytes) -> None:
 def test_what_a_file_does_not_say_stays_as_it_is() -> None:
     base = Whole("x", part=Part((1, 2), 0.3))
     assert overlay(base, {"part": {"mix": 0.4}}) == Whole("x", part=Part((1, 2), 0.4))
-    with pytest.raises(FieldError, match=r"scene\.part\.mix: must be from 0 to 1, not 3"):
+    with pytest.raises(FieldError, match=r"scene\.part\.mix: must lie in 0 to 1, not 3"):
         overlay(base, {"part": {"mix": 3}}, ("scene",))
 
 

@@ -362,6 +362,10 @@ SPOILT: dict[str, tuple[Callable[[dict[str, torch.Tensor], dict[str, Any]], obje
         lambda tensors, _: tensors.update({"episodes.actions": torch.zeros(1, dtype=torch.int8)}),
         "actions of its episodes",
     ),
+    "an episode is shorter than nothing": (
+        lambda tensors, _: tensors["episodes.counts"][:2].add_(torch.tensor([-100, 100])),
+        "actions of its episodes",
+    ),
     "fewer environments": (lambda _, state: state["began"].pop(), "environments"),
     "an outcome is none": (lambda _, state: state.update(recent=["triumph"]), "recent outcomes"),
     "decisions are none": (lambda _, state: state.update(decisions="many"), "decisions"),

@@ -13,7 +13,7 @@ from tests.dataset.test_recorder import contents
 from tests.scenes.own_networks import OWN_NETWORKS, OwnNetwork, write_config
 from tint_sumo.cli import main
 from tint_sumo.config import TraitSettings
-from tint_sumo.dataset.inspection import inspect, plot
+from tint_sumo.dataset.inspection import Distribution, Inspection, TraitStatistics, _boxes, inspect, plot
 from tint_sumo.dataset.own_recorder import EPISODES_PER_SHARD, record_sumocfg
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, shard_file
 from tint_sumo.dataset.shards import EPISODE_STEPS
@@ -156,6 +156,19 @@ def test_the_dataset_can_be_inspected(merge_data: Path, tmp_path: Path) -> None:
     assert found.traits["calm"].speed_mps.quantile(1.0) < found.traits["hasty"].speed_mps.quantile(1.0)
     plot(found, tmp_path / "found.png")
     assert (tmp_path / "found.png").stat().st_size > 10_000
+
+
+def test_the_figure_of_many_vtypes_names_those_that_drive_and_has_room_for_them() -> None:
+    values = Distribution.of(pd.Series([0.0, 2.0, 400.0]))
+    traits = {f"vtype_{one}": TraitStatistics(one, one, values, values, values) for one in range(40)}
+    manifest = {"windows": 7, "vtypes": list(traits), "population": None}
+    figure = _boxes(Inspection(manifest, traits, values, values))
+    speed, *_ = figure.axes
+    names = [label.get_text() for label in speed.get_yticklabels()]
+    assert names == [f"vtype_{one} ({one} drivers)" for one in range(39, 15, -1)]
+    assert len(speed.patches) == len(names) and figure.get_figheight() > 10
+    assert speed.get_xlim()[1] >= 400.0
+    assert "16 vTypes with fewer drivers or none are left out" in figure.get_suptitle()
 
 
 @pytest.mark.parametrize(

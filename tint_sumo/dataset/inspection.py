@@ -26,6 +26,7 @@ from tint_sumo.progress import make_bar
 
 RESOLUTION = 0.01  # m, m/s or s: values are rounded to multiples of it
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+_MOST_ROWS = 24  # vTypes in a figure
 Colour = tuple[float, float, float]  # red, green and blue, each in [0, 1]
 _KEYS = ["episode", "vehicle"]
 
@@ -202,7 +203,58 @@ def _told(value: object) -> str:
 
 
 def plot(inspection: Inspection, file: Path) -> None:
-    """Write a PNG of the distributions of speed, gap and time on the street, per trait."""
+    """Write a picture of the distributions of speed, gap and time on the street, per trait.
+
+    The few profiles of a built-in scene are histograms; the vTypes of a SUMO configuration, which can be many, are rows
+    of boxes.
+    """
+    figure = _histograms(inspection) if own_vtypes(inspection.manifest) is None else _boxes(inspection)
+    with whole_file(file) as partial:
+        figure.savefig(partial, format=file.suffix.lower().removeprefix("."))
+
+
+def _boxes(inspection: Inspection) -> Figure:
+    """Return a figure with a row per vType that has drivers: median, middle half, and where 90 % of the values lie."""
+    by_drivers = sorted(inspection.traits.items(), key=lambda pair: -pair[1].drivers)
+    shown = [(vtype, one) for vtype, one in by_drivers if one.drivers][:_MOST_ROWS]
+    figure = Figure(figsize=(12.0, 1.8 + 0.42 * max(len(shown), 1)), dpi=150, layout="constrained")
+    speed, gap, track = figure.subplots(1, 3, sharey=True)
+    for row, (_, one) in enumerate(shown):
+        for axes, distribution in ((speed, one.speed_mps), (gap, one.gap_m), (track, one.track_s)):
+            _draw_box(axes, distribution, row)
+    speed.set(xlabel="speed (m/s)", ylim=(len(shown) - 0.5, -0.5))
+    speed.set_yticks(range(len(shown)), [f"{vtype} ({one.drivers:,} drivers)" for vtype, one in shown])
+    gap.set(xlabel="gap to the leader, if there is one (m)")
+    track.set(xlabel="time on the street (s)")
+    for axes in (speed, gap, track):
+        axes.set_xlim(0, None)
+        axes.grid(alpha=0.25, axis="x")
+    left_out = len(by_drivers) - len(shown)
+    note = f"; {left_out} vTypes with fewer drivers or none are left out" if left_out else ""
+    figure.suptitle(_title(inspection) + note, fontsize=11)
+    figure.supxlabel("boxes: the middle half and the median; lines: from 5 to 95 %", fontsize=8)
+    return figure
+
+
+def _draw_box(axes: Axes, distribution: Distribution, row: int) -> None:
+    """Draw a box in a row; nothing where there are no values."""
+    if len(distribution.value) == 0:
+        return
+    names = ("whislo", "q1", "med", "q3", "whishi")
+    box = {name: distribution.quantile(fraction) for name, fraction in zip(names, QUANTILES, strict=True)}
+    style: dict[str, Any] = {
+        **{"orientation": "horizontal", "showfliers": False, "patch_artist": True, "manage_ticks": False},
+        **{"boxprops": {"facecolor": "#c3d9ee"}, "medianprops": {"color": "black"}},
+    }
+    axes.bxp([box], positions=[row], widths=0.6, **style)
+
+
+def _title(inspection: Inspection) -> str:
+    return f"{inspection.manifest['windows']:,} windows, {inspection.episode_s.count.sum():,} episodes of traffic"
+
+
+def _histograms(inspection: Inspection) -> Figure:
+    """Return a figure with the distributions of each profile upon each other."""
     figure = Figure(figsize=(12.0, 4.2), dpi=150, layout="constrained")
     speed, gap, track = figure.subplots(1, 3)
     colours = _colours(inspection.manifest)
@@ -218,15 +270,13 @@ def plot(inspection: Inspection, file: Path) -> None:
         axes.set_ylim(0, None)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
         axes.grid(alpha=0.25)
-    episodes = inspection.episode_s.count.sum()
-    figure.suptitle(f"{inspection.manifest['windows']:,} windows, {episodes:,} episodes of traffic")
+    figure.suptitle(_title(inspection))
     known = [
         Patch(color=colour, alpha=0.5, label=f"{trait} ({inspection.traits[trait].drivers:,} drivers)")
         for trait, colour in colours.items()
     ]
     figure.legend(handles=known, loc="outside lower center", ncols=len(known), frameon=False)
-    with whole_file(file) as partial:
-        figure.savefig(partial, format=file.suffix.lower().removeprefix("."))
+    return figure
 
 
 def _draw(axes: Axes, distribution: Distribution, colour: Colour, width: float) -> None:

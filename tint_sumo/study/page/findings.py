@@ -10,7 +10,7 @@ from tint_sumo.study.rows import Summary, at_mixes, by_title, over_all_mixes
 
 MEANING_OF_P = (
     "P is P(conservative): the probability that a driver is conservative, and yields when the ego moves in front of "
-    "it. All other drivers are aggressive and do not yield. The ego is not told who is who."
+    "it. All other drivers are aggressive and do not yield. Only the method oracle is told who is who."
 )
 
 

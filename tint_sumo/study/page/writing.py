@@ -117,7 +117,8 @@ def _summary(rows: Sequence[Row]) -> list[str]:
     methods = len({(row.method, row.origin) for row in rows})
     seeds = max(len(row.seeds) for row in rows)
     episodes = sum(row.episodes * len(row.seeds) for row in rows)
-    sizes = f"{methods} methods, up to {seeds} seeds of each, {episodes:,} episodes in all."
+    trained = "1 seed" if seeds == 1 else f"up to {seeds} seeds"
+    sizes = f"{methods} methods, {trained} of each, {episodes:,} episodes in all."
     return [one for one in (what_came_out(rows), MEANING_OF_P, sizes) if one]
 
 

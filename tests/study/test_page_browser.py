@@ -300,6 +300,28 @@ def test_windows_of_the_latent_space_by_pointer_touch_and_keyboard(browser: Any,
     opened.context.close()
 
 
+def test_the_page_runs_no_script_but_its_own(browser: Any, study: Path, tmp_path: Path) -> None:
+    injected = """
+        <script>window.ran = "inline"</script>
+        <script type="module">window.ran = "module"</script>
+        <script src="data:text/javascript,window.ran='data'"></script>
+        <img src="data:," onerror="window.ran = 'handler'">
+        <a href="javascript:window.ran = 'link'">injected</a>
+        <style>body { color: red }</style>
+    """
+    page_file = tmp_path / "report.html"
+    text = (study / "report.html").read_text(encoding="utf-8")
+    page_file.write_text(text.replace("<main", f"{injected}<main", 1), encoding="utf-8")
+    assert "unsafe-inline" not in re.sub("style-src-attr 'unsafe-inline'", "", text)
+    opened = Opened(browser, page_file)
+    opened.page.click("a[href^=javascript]")
+    opened.page.evaluate("document.body.append(Object.assign(document.createElement('script'), {text: 'ran = 1'}))")
+    assert opened.page.evaluate("typeof window.ran") == "undefined"
+    assert opened.page.evaluate("getComputedStyle(document.body).color") != "rgb(255, 0, 0)"
+    assert len([one for one in opened.troubles if "Content Security Policy" in one]) >= 7
+    opened.context.close()
+
+
 def test_print_has_light_charts_and_open_tables(browser: Any, study: Path) -> None:
     opened = Opened(browser, study / "report.html", color_scheme="dark")
     page = opened.page

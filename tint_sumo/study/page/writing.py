@@ -1,6 +1,7 @@
 """The page: its sections, put together with its style and its scripts."""
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,7 +20,7 @@ from tint_sumo.study.page.charts import Chart, curve_chart, outcome_chart, world
 from tint_sumo.study.page.choosing import choose
 from tint_sumo.study.page.episodes import Recordings, failure_lists, player_data, player_notes, record_episodes
 from tint_sumo.study.page.findings import MEANING_OF_P, what_came_out
-from tint_sumo.study.page.html import chart, folded, json_data, packed, paragraph, section, table
+from tint_sumo.study.page.html import chart, content_policy, folded, json_data, packed, paragraph, section, table
 from tint_sumo.study.page.latents import read_latents
 from tint_sumo.study.policy_jobs import read_curves
 from tint_sumo.study.report import StudyReport
@@ -29,6 +30,8 @@ from tint_sumo.study.training import POLICY
 
 PAGE_FILE = "report.html"
 _STATIC = Path(__file__).with_name("static")
+_STYLE_OF_PLOTLY = ""  # it adds its rules one by one to an element without text
+_STYLE_OF_MAPS = re.compile(r'getElementById\("([0-9a-f]{64})"\)')  # it is added unless there is such an element
 _SCRIPTS = ("unpacking.js", "theme.js", "printing.js", "scene.js", "player.js", "latents.js", "charts.js")
 
 
@@ -96,16 +99,24 @@ def _page(study: _Study) -> str:
         ("making", "How it was made", _making(study)),
     ]
     title = f"Study {study.out.resolve().name}"
+    script, style = "\n".join(_static(name) for name in _SCRIPTS), _static("page.css")
+    plotly = get_plotlyjs() if charts else ""
     return Template(_static("page.html")).substitute(
+        policy=content_policy([script, plotly], [style, _STYLE_OF_PLOTLY]),
         title=escape(title),
         summary="".join(map(paragraph, _summary(study.rows))),
-        style=_static("page.css"),
+        style=style,
         contents="".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, heading, _ in sections),
         sections="".join(section(name, heading, content) for name, heading, content in sections),
         data=json_data("chart-data", {one.name: one.figure for one in charts}) + _data(study),
-        script="\n".join(_static(name) for name in _SCRIPTS),
-        plotly=packed("plotly", get_plotlyjs()) if charts else "",
+        script=script,
+        plotly=_without_maps(plotly) + packed("plotly", plotly) if charts else "",
     )
+
+
+def _without_maps(plotly: str) -> str:
+    """Return elements that keep Plotly from adding the style of its maps, which the page has none of."""
+    return "".join(f'<template id="{name}"></template>' for name in _STYLE_OF_MAPS.findall(plotly))
 
 
 @cache

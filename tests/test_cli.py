@@ -2,11 +2,13 @@
 
 import json
 import os
+import platform
 import re
 import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import pytest
 import torch
 
 from tests.terminal import look, open_terminal
-from tint_sumo import traits
+from tint_sumo import __version__, traits
 from tint_sumo.checkpoints import CHECKPOINT_FILE
 from tint_sumo.cli import main
 from tint_sumo.config import TraitSettings
@@ -44,6 +46,7 @@ COMMANDS = (
     "study report",
     "render",
     "bench",
+    "models",
 )
 
 
@@ -99,6 +102,49 @@ def test_every_command_has_help_and_json(command: str, capsys: pytest.CaptureFix
     assert "--json" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("columns", [60, 80])
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_boxes_fit_the_terminal(
+    command: str, columns: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--help"])
+    _, _, boxes = capsys.readouterr().out.split("\n\n", 2)  # behind the usage and what the command does
+    assert max(map(len, boxes.splitlines())) == columns
+
+
+def test_versions_are_told_at_once() -> None:
+    script = (
+        "import sys, tint_sumo.cli\n"
+        "assert tint_sumo.cli.main(['--version']) == 0\n"
+        "print([name for name in ('torch', 'libsumo') if name in sys.modules])"
+    )
+    printed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert printed.splitlines() == [
+        f"tint-sumo {__version__}",
+        f"SUMO {version('libsumo')}, torch {torch.__version__}, gymnasium {version('gymnasium')}, "
+        f"Python {platform.python_version()}",
+        "[]",
+    ]
+
+
+def test_models_are_listed_and_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    models = run(capsys, "models")["models"]
+    kinds = {kind: {one["name"] for one in models if one["kind"] == kind} for kind in ("trait model", "policy")}
+    learned = {name for name, method in METHODS.items() if isinstance(method, Learned)}
+    assert kinds == {"trait model": set(traits.TRAIT_METHODS), "policy": learned}
+    assert {one["scene"] for one in models} == {"t_intersection"}
+    assert all("% of windows" in one["result"] or one["result"].startswith("success ") for one in models)
+    assert main(["models"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["name", "kind", "method", "scene", "training", "result"]
+    assert len(lines) == 1 + len(models)
+    cards = run(capsys, "models", "vae")["models"]
+    assert [(one["kind"], one["card"]["method"]) for one in cards] == [("trait model", "vae"), ("policy", "vae")]
+    assert "unknown shipped model 'nobody'; choose one of: classifier, " in refuse(capsys, "models", "nobody")
+
+
 def test_help_is_quick() -> None:
     script = (
         "import sys, tint_sumo.cli\n"
@@ -147,6 +193,7 @@ def test_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_traits(dataset: Path, tmp_path: Path, trait_model: Path, capsys: pytest.CaptureFixture[str]) -> None:
     printed = run(capsys, "traits", "evaluate", "--data", dataset, "--model", trait_model, "--noise", 0.1)
     assert 0.0 <= printed["accuracy"] <= 1.0
+    assert 0.5 <= printed["majority_share"] < 1.0
     assert printed["noise_m"] == 0.1
     assert 0 < printed["windows"] < json.loads((dataset / "manifest.json").read_text())["windows"]
     printed = run(capsys, "traits", "plot", "--data", dataset, "--model", trait_model, "--out", tmp_path)
@@ -165,6 +212,10 @@ def test_traits_infer(
     assert printed["columns"] == list(table)
     assert printed["windows"] == len(table) == json.loads((dataset / "manifest.json").read_text())["windows"]
     assert printed["vehicles"] == table["vehicle"].nunique()
+    assert printed["outside"] is None  # this model's card does not tell
+    assert main(["traits", "infer", "--fcd", str(dataset), "--model", "vae", "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"\n<?\d+\.\d% of the windows lie outside what the model was trained on\n", text)
 
 
 def test_policy_evaluate(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,10 +10,9 @@ from pathlib import Path
 import pandas
 import pytest
 
+from tests.commands import commands
 from tests.documents import blocks
 from tests.study.browser import FLAGS, require_browser
-from tint_sumo.cli import TintSumo
-from tint_sumo.configuration import subcommands
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.percentages import percent
 from tint_sumo.study.results_csv import read_csv
@@ -106,16 +105,10 @@ def test_the_site_is_searched_and_read_from_a_folder(site: Path) -> None:
     assert troubles == []
 
 
-def command_names(kind: type, before: str = "tint-sumo") -> list[str]:
-    """The names of all commands below a group."""
-    below = subcommands(kind)
-    return [name for word, one in below.items() for name in command_names(one, f"{before} {word}")] or [before]
-
-
 def test_every_command_is_in_the_reference() -> None:
     reference = (DOCS / "reference" / "commands.md").read_text(encoding="utf-8")
     shown = re.findall(r"^COLUMNS=100 (tint-sumo .*) --help$", reference, re.MULTILINE)
-    assert sorted(shown) == sorted(command_names(TintSumo))
+    assert sorted(shown) == sorted(f"tint-sumo {name}" for name, _ in commands())
     assert re.findall(r"^## (tint-sumo .*)$", reference, re.MULTILINE) == shown
 
 

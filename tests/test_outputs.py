@@ -1,14 +1,13 @@
 """No command writes over what it reads, or into the folder of a run that is not its own."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from tint_sumo.cli import TintSumo, main
-from tint_sumo.configuration import subcommands
+from tests.commands import commands
+from tint_sumo.cli import main
 from tint_sumo.files import PICTURE_SUFFIXES, RUN_FILE, write_json, write_text
 
 # How each command that writes is called; OUT is what it must not touch.
@@ -30,15 +29,6 @@ WRITING = {
 READING = {"study log"}  # their --out is what they read
 FILES = ("manifest.json", "trajectories/shard-00000.parquet", "provenance.json", "table.csv", "figure.png", "film.gif")
 FOLDERS = ("", "trajectories")
-
-
-def commands(kind: type = TintSumo, name: str = "") -> Iterator[tuple[str, type]]:
-    """Name and class of every command."""
-    below = subcommands(kind)
-    if not below:
-        yield name, kind
-    for word, one in below.items():
-        yield from commands(one, f"{name} {word}".strip())
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ from tint_sumo.errors import BAD_PATHS, InputError, JobError, system_problem
 from tint_sumo.files import PICTURE_SUFFIXES, require_output_file, require_output_folder
 from tint_sumo.percentages import percent
 from tint_sumo.processes import end_quickly, interrupt_on_sigterm
-from tint_sumo.provenance import Origin, made_by
+from tint_sumo.provenance import Origin, made_by, version_text
 from tint_sumo.ranges import Range, require_ranges
 from tint_sumo.redaction import redact
 from tint_sumo.stores import name_in, working_folder
@@ -351,6 +351,7 @@ class EvaluateTraits(Command):
         parts = {**found["by_length"], **found["by_leader"]}
         lines = [
             f"linear SVC         {percent(found['accuracy'], 3):>7}% of {found['windows']} windows",
+            f"majority share     {percent(found['majority_share'], 3):>7}% (of always taking the most frequent trait)",
             f"nearest neighbours {percent(found['knn_accuracy'], 3):>7}%",
             *(
                 f"  {_part_name(name):16} {percent(part['accuracy'], 3):>7}%"
@@ -408,7 +409,7 @@ class InferTraits(Command):
     """Length of the vehicles in floating-car data, m."""
 
     def run(self) -> Outcome:
-        from tint_sumo.traits.inference import SUFFIXES, infer_traits, write_table
+        from tint_sumo.traits.inference import OUTSIDE, SUFFIXES, infer_traits, write_table
 
         if self.out.exists() and self.fcd.exists() and self.out.samefile(self.fcd):
             raise InputError(f"{self.out} holds the data themselves; choose another --out")
@@ -416,9 +417,13 @@ class InferTraits(Command):
         _use_one_thread()
         table = infer_traits(self.fcd, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length)
         write_table(table, self.out)
+        outside = float(table[OUTSIDE].mean()) if OUTSIDE in table else None
         content = {"out": str(self.out), "windows": len(table), "vehicles": int(table["vehicle"].nunique())}
-        text = f"{content['windows']} windows of {content['vehicles']} vehicles: {self.out}"
-        return Outcome(text, {**content, "columns": list(table)})
+        reach = "how many are outside is not known, since the model's card does not tell what it was trained on"
+        if outside is not None:
+            reach = f"{percent(outside)}% of the windows lie outside what the model was trained on"
+        text = f"{content['windows']} windows of {content['vehicles']} vehicles: {self.out}\n{reach}"
+        return Outcome(text, {**content, "outside": outside, "columns": list(table)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -759,6 +764,24 @@ class Bench(Command):
         return Outcome(found.table(), found.to_json())
 
 
+@dataclass(frozen=True, kw_only=True)
+class Models(Command):
+    """List the trained models that are shipped: kind, method, scene, training and main result; or show one's card."""
+
+    name: Positional[str | None] = None
+    """Name of a shipped model, whose card is shown; a trait model and a policy may share it."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.study.shipped_models import card_text, models_named, models_table, shipped_models
+
+        if self.name is None:
+            models = shipped_models()
+            return Outcome(models_table(models), {"models": [model.summary() for model in models]})
+        models = models_named(self.name)
+        content = [{**model.summary(), "card": model.card} for model in models]
+        return Outcome("\n\n".join(map(card_text, models)), {"models": content})
+
+
 # tyro makes subcommands of unions only, hence the None.
 @dataclass(frozen=True)
 class Dataset:
@@ -807,6 +830,8 @@ class Study:
 class TintSumo:
     """Driving among strangers: driver-trait inference and intersection navigation on Eclipse SUMO."""
 
+    version: bool = False
+    """Print the version, and those of SUMO, torch, gymnasium and Python, and do nothing else."""
     print_completion: Shell | None = None
     """Print a script that completes commands and flags in that shell, and do nothing else. For bash, put this line into
     ~/.bashrc: eval "$(tint-sumo --print-completion bash)"."""
@@ -820,6 +845,7 @@ class TintSumo:
         | Annotated[Study, subcommand("study")]
         | Annotated[Render, subcommand("render")]
         | Annotated[Bench, subcommand("bench")]
+        | Annotated[Models, subcommand("models")]
     )
 
 
@@ -848,6 +874,9 @@ def _run(words: list[str]) -> int:
     after_interrupt = Command.after_interrupt
     if words[:1] == ["--print-completion"] and words[1:] in ([shell] for shell in get_args(Shell)):
         print(_completion_script(words[1]), end="")
+        return 0
+    if words == ["--version"]:
+        print(version_text())
         return 0
     try:
         command = parse(words)

@@ -65,6 +65,13 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
     return {name: version(name) for name in packages} | {"python": platform.python_version()}
 
 
+def version_text() -> str:
+    """Return the version of this package, and those of what it stands on in a second line."""
+    shown = {"SUMO": "libsumo", "torch": "torch", "gymnasium": "gymnasium", "Python": "python"}
+    found = versions(("tint_sumo", "libsumo", "torch", "gymnasium"))
+    return f"tint-sumo {found['tint_sumo']}\n" + ", ".join(f"{name} {found[key]}" for name, key in shown.items())
+
+
 @cache
 def commit(checkout: Path = _CHECKOUT) -> str | None:
     """The git commit of a checkout, with ``-dirty`` if files differ from it; None where there is no checkout."""

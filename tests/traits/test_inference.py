@@ -46,7 +46,8 @@ def test_a_dataset_gives_the_latents_of_its_windows(dataset: Path) -> None:
     expected = encode_windows(load("vae"), windows)
     np.testing.assert_allclose(table[LATENTS], expected.mean, atol=1e-5)
     np.testing.assert_allclose(table[STDS], expected.std, rtol=1e-4)
-    assert list(table) == [*KEYS, *LATENTS, *STDS]
+    assert list(table) == [*KEYS, *LATENTS, *STDS, "outside"]
+    assert table["outside"].mean() < 0.01
     np.testing.assert_array_equal(table["steps"], windows.length)
     np.testing.assert_allclose(table["end_s"] - table["start_s"], 0.1 * (table["steps"] - 1), atol=1e-3)
     assert table.groupby("vehicle", observed=True)["window"].apply(lambda part: list(part) == [*range(len(part))]).all()

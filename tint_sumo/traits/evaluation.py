@@ -38,6 +38,7 @@ class TraitAccuracy:
 
     accuracy: float  # share of windows that a linear support vector classifier gets right
     knn_accuracy: float  # the same of the nearest neighbours in the latent space
+    majority_share: float  # what one gets right who always takes the most frequent trait
     windows: int
     error_m: float | None  # root mean square of reconstructed or predicted positions; None if the method has none
     # Share of the linear classifier's errors; None without errors or with point estimates.
@@ -104,6 +105,7 @@ class Probe:
         return TraitAccuracy(
             accuracy=float(correct.mean()),
             knn_accuracy=float(nearest.mean()),
+            majority_share=float(np.unique(labels, return_counts=True)[1].max() / len(labels)),
             windows=len(windows),
             error_m=position_error_m(self._model, windows, noise_m=self._noise_m, seed=self._seed + 1),
             errors_in_most_uncertain_tenth=_share_of_errors(correct, latents.std),

@@ -14,9 +14,11 @@ from tint_sumo.errors import InputError
 from tint_sumo.files import require_output_file, whole_file
 from tint_sumo.traits.cross_window import CrossWindow, fuse
 from tint_sumo.traits.evaluation import Latents, encode_windows
-from tint_sumo.traits.storage import load
+from tint_sumo.traits.input_range import InputRange
+from tint_sumo.traits.storage import load, read_card
 
 SUFFIXES = (".csv", ".parquet")
+OUTSIDE = "outside"  # the column
 
 
 def infer_traits(
@@ -38,12 +40,13 @@ def infer_traits(
         vehicle (id), window (0, 1, ... of the vehicle), start_s, end_s, steps, has_leader (one within 20 m at every
         step), latent_1, ... and std_1, ... (mean and standard deviation of the window's posterior). Of
         ``cross_window``, also fused_latent_1, ... and fused_std_1, ...: what the vehicle's windows say together, up
-        to this one.
+        to this one. If the model's card knows the range of its training's inputs, also outside: whether the window has
+        a step whose offset or gap no training window had.
 
     Raises:
         InputError: unusable data, network, length or model.
     """
-    trained = load(model)
+    trained, reach = load(model), InputRange.from_card(read_card(model))
     rows = read_tracks(source, net_file=net_file, vehicle_length_m=vehicle_length_m)
     track = rows["track"].to_numpy()
     gap_m = rows["gap_m"].where(rows["gap_m"] < NO_LEADER_GAP_M).to_numpy()
@@ -64,6 +67,7 @@ def infer_traits(
             "has_leader": windows.has_leader,
             **_columns("", latents),
             **(_columns("fused_", _fuse_so_far(latents, number)) if isinstance(trained, CrossWindow) else {}),
+            **({} if reach is None else {OUTSIDE: reach.outside(windows)}),
         }
     )
 

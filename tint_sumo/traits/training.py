@@ -32,6 +32,7 @@ from tint_sumo.progress import Progress, Report, silent
 from tint_sumo.ranges import Range
 from tint_sumo.training_log import open_log
 from tint_sumo.traits.batches import TrainingWindows, WindowBatch
+from tint_sumo.traits.input_range import InputRange
 from tint_sumo.traits.model import TraitModel, find_trait_method
 from tint_sumo.traits.storage import RUN_MODEL, load, save
 
@@ -102,7 +103,8 @@ def train(
             loss = run.fit(out, report)
 
         known = {key: identity[key] for key in ("seed", "windows", "windows_sha256")}
-        save(model, out / RUN_MODEL, {**known, "loss": loss, **(card or {})})
+        reach = InputRange.of(windows.parts()).to_card()
+        save(model, out / RUN_MODEL, {**known, "loss": loss, **reach, **(card or {})})
         remove_checkpoint(out)
         return model.eval().requires_grad_(False)
 

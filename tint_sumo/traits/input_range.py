@@ -1,0 +1,73 @@
+"""What the windows of a model's training reach, and which other windows lie outside of it."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tint_sumo.config import WINDOW_STEPS
+from tint_sumo.dataset.windows import Windows
+from tint_sumo.errors import InputError
+
+MARGIN_M = 0.1  # positions with two decimals, as SUMO writes them, are no other input
+
+_Steps = tuple[float, ...]  # WINDOW_STEPS numbers, m
+
+
+@dataclass(frozen=True)
+class InputRange:
+    """The least and the most that each step of the training windows has: offset from the first position, and gap."""
+
+    low_offset_m: _Steps
+    high_offset_m: _Steps
+    low_gap_m: _Steps
+    high_gap_m: _Steps
+
+    @classmethod
+    def of(cls, parts: Iterable[Windows]) -> Self:
+        """Return the range of windows that come in parts."""
+        low, high = np.full((WINDOW_STEPS, 2), np.inf), np.full((WINDOW_STEPS, 2), -np.inf)
+        for part in parts:
+            there = _there(part)[:, :, None]
+            low = np.minimum(low, np.where(there, part.states, np.inf).min(axis=0))
+            high = np.maximum(high, np.where(there, part.states, -np.inf).max(axis=0))
+        missing = low > high  # no window is so long: every value there is outside
+        low, high = np.where(missing, 0.0, low), np.where(missing, -1.0, high)
+        rounded = (np.round(one, 3).tolist() for one in (low[:, 0], high[:, 0], low[:, 1], high[:, 1]))
+        return cls(*map(tuple, rounded))
+
+    @classmethod
+    def from_card(cls, card: Mapping[str, Any]) -> Self | None:
+        """Return the range that a model's card gives; None if it does not know it.
+
+        Raises:
+            InputError: what the card gives is no range.
+        """
+        given = card.get("input_range")
+        if given is None:
+            return None
+        try:
+            found = {name: tuple(map(float, given[name])) for name in cls.__dataclass_fields__}
+        except (KeyError, TypeError, ValueError):
+            found = {}
+        if not found or any(len(steps) != WINDOW_STEPS for steps in found.values()):
+            raise InputError("the card of the trait model has an input_range that is none; restore the file")
+        return cls(**found)
+
+    def to_card(self) -> dict[str, Any]:
+        """Return what a model's card says of it."""
+        return {"input_range": asdict(self)}
+
+    def outside(self, windows: Windows) -> NDArray[np.bool_]:
+        """Return which of N windows have a step whose offset or gap no training window had at that step, (N,)."""
+        low = np.stack((self.low_offset_m, self.low_gap_m), axis=-1) - MARGIN_M
+        high = np.stack((self.high_offset_m, self.high_gap_m), axis=-1) + MARGIN_M
+        beyond = ((windows.states < low) | (windows.states > high)).any(axis=2)
+        return np.asarray((beyond & _there(windows)).any(axis=1))
+
+
+def _there(windows: Windows) -> NDArray[np.bool_]:
+    """Return which steps windows have, (N, 20)."""
+    return np.asarray(np.arange(WINDOW_STEPS) < windows.length[:, None])

@@ -63,7 +63,7 @@ def test_a_card_keeps_it() -> None:
 def test_a_damaged_one_is_refused(broken: object) -> None:
     steps = {"short": [0.0] * 19, "text": ["far"] * 20}.get(str(broken))
     held = dict.fromkeys(("low_offset_m", "high_offset_m", "low_gap_m", "high_gap_m"), steps) if steps else broken
-    with pytest.raises(InputError, match="input_range that is none; restore the file"):
+    with pytest.raises(InputError, match=r"card of the trait model: input_range.*; restore the file"):
         InputRange.from_card({"input_range": held})
 
 

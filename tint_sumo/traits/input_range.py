@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tint_sumo.config import WINDOW_STEPS
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.errors import InputError
+from tint_sumo.structures import FieldError, build
 
 MARGIN_M = 0.1  # positions with two decimals, as SUMO writes them, are no other input
 
@@ -24,6 +25,11 @@ class InputRange:
     high_offset_m: _Steps
     low_gap_m: _Steps
     high_gap_m: _Steps
+
+    def __post_init__(self) -> None:
+        for name, steps in asdict(self).items():
+            if len(steps) != WINDOW_STEPS:
+                raise InputError(f"{name} must have {WINDOW_STEPS} numbers, not {len(steps)}")
 
     @classmethod
     def of(cls, parts: Iterable[Windows]) -> Self:
@@ -49,12 +55,10 @@ class InputRange:
         if given is None:
             return None
         try:
-            found = {name: tuple(map(float, given[name])) for name in cls.__dataclass_fields__}
-        except (KeyError, TypeError, ValueError):
-            found = {}
-        if not found or any(len(steps) != WINDOW_STEPS for steps in found.values()):
-            raise InputError("the card of the trait model has an input_range that is none; restore the file")
-        return cls(**found)
+            found: Self = build(cls, given, ("input_range",))
+        except FieldError as error:
+            raise InputError(f"the card of the trait model: {error}; restore the file") from None
+        return found
 
     def to_card(self) -> dict[str, Any]:
         """Return what a model's card says of it."""

@@ -18,6 +18,7 @@ import argparse
 import ast
 import os
 import random
+import shlex
 import shutil
 import signal
 import subprocess
@@ -55,7 +56,7 @@ TESTS = {  # by the module that is broken
     "envs/episodes": "tests/envs/test_episodes.py",
     "dataset/windows": "tests/dataset/test_windows.py",
     "traits/vae": "tests/traits/test_vae.py",
-    "traits/cross_window": "tests/traits/test_cross_window.py",
+    "traits/cross_window": "tests/traits/test_cross_window.py -k 'not uncertainty'",
     "policy/loss": "tests/policy/test_loss.py",
     "policy/ppo": "tests/policy/test_ppo.py",
     "policy/buffer": "tests/policy/test_buffer.py",
@@ -119,7 +120,7 @@ def _copy_tree(tree: Path) -> Path:
 
 
 def _break_module(name: str, tree: Path, arguments: argparse.Namespace, end_s: float) -> Tally:
-    file, tests = tree / "tint_sumo" / f"{name}.py", TESTS[name].split()
+    file, tests = tree / "tint_sumo" / f"{name}.py", shlex.split(TESTS[name])
     source = file.read_text(encoding="utf-8")
     session = WORK / f"{name.replace('/', '-')}-{sha256(source.encode()).hexdigest()[:8]}.sqlite"
     with use_db(str(session)) as db:

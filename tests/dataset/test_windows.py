@@ -17,6 +17,7 @@ from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, TRAJECTORY
 from tint_sumo.dataset.windows import (
     Windows,
     cut_windows,
+    joined,
     load_labels,
     load_windows,
     read_manifest,
@@ -277,3 +278,22 @@ def test_simulating_twice_gives_the_same_rows() -> None:
     simulation.close()
     pd.testing.assert_frame_equal(first[0], second[0])
     pd.testing.assert_frame_equal(first[1], second[1])
+
+
+def numbered(*episodes: int) -> Windows:
+    """Windows of vehicle 7 in each of some episodes."""
+    count, episode = len(episodes), np.array(episodes)
+    driver = episode * 100_000 + 7
+    return Windows(np.zeros((count, 20, 2), np.float32), np.full(count, 20), driver, episode, np.ones(count, bool))
+
+
+def test_joined_windows_are_numbered_as_if_their_episodes_followed_each_other() -> None:
+    whole = joined([numbered(0, 2), numbered(0, 1), numbered(3)])
+    assert whole.episode.tolist() == [0, 2, 3, 4, 8]
+    assert whole.driver.tolist() == [episode * 100_000 + 7 for episode in whole.episode]
+    assert len(whole) == len(whole.states) == len(whole.has_leader) == 5
+
+
+def test_parts_are_the_windows_in_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tint_sumo.dataset.windows.PART", 3)
+    assert [part.episode.tolist() for part in numbered(*range(8)).parts()] == [[0, 1, 2], [3, 4, 5], [6, 7]]

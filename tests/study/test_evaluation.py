@@ -9,7 +9,7 @@ from tint_sumo.config import STEP_S
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.errors import InputError
 from tint_sumo.progress import Progress
-from tint_sumo.study.evaluation import CASE_SEED, Case, Evaluation, case_seed, evaluate
+from tint_sumo.study.evaluation import CASE_SEED, Case, Evaluation, case_seed, evaluate, require_cases
 from tint_sumo.study.rules import AlwaysGo, TimeToCollision
 
 make_venv = partial(SceneVecEnv, p_conservative=0.6, time_limit_s=12.0)
@@ -93,11 +93,12 @@ def test_the_environment_is_closed_and_progress_told() -> None:
         made.append(make_venv(num_envs))
         return made[-1]
 
-    evaluate(AlwaysGo(), make, 5, 0, batch=4, report=told.append)
+    found = evaluate(AlwaysGo(), make, 5, 0, batch=4, report=told.append)
     evaluate(AlwaysGo(), partial(make_venv, backend="libsumo"), 1, 0)  # refused if libsumo were still busy
     assert [venv.num_envs for venv in made] == [4]
     assert [(one.done, one.total, one.unit) for one in told] == [(done, 5, "case") for done in range(1, 6)]
     assert all(set(one.measures) == {"success", "collision"} for one in told)
+    assert told[-1].measures == {name: found.rate(name).value for name in ("success", "collision")}
 
 
 def test_summary() -> None:
@@ -112,5 +113,7 @@ def test_summary() -> None:
 
 @pytest.mark.parametrize(("episodes", "seed"), [(0, 0), (-1, 0), (2_000_000, 0), (1, -1), (1, 1001)])
 def test_bad_values_are_refused(episodes: int, seed: int) -> None:
+    require_cases(1, 1000)
+    require_cases(1_000_000, 0)
     with pytest.raises(InputError, match="must lie in"):
         evaluate(AlwaysGo(), make_venv, episodes, seed)

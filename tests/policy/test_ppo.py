@@ -241,6 +241,18 @@ def test_numbers_that_are_not_finite_stop_the_training_before_they_reach_the_wei
     assert weights(model).isfinite().all()
 
 
+@pytest.mark.parametrize("work", ["rollout", "update"])
+def test_outputs_that_overflow_in_the_last_layer_stop_the_training(work: str) -> None:
+    """In a rollout, and in the updates that follow on one: hidden layers are finite there."""
+    model = make(Memory(4), n_steps=8)
+    model.learn(32)
+    with torch.no_grad():
+        for parameter in (model.policy.action_net.weight, model.policy.action_net.bias):
+            parameter.fill_(3e38)
+    with pytest.raises(DivergedError, match="outputs are not finite"):
+        model.learn(32, reset_num_timesteps=False) if work == "rollout" else model.train()
+
+
 def test_a_step_that_leads_to_weights_that_are_not_finite_stops_the_training() -> None:
     model = make(Memory(4), n_steps=8, learning_rate=1e45, n_epochs=1, n_minibatches=1)
     with pytest.raises(DivergedError, match=r"at step 32: the weights are not finite.* \(it is 1e\+45 there\)"):
@@ -263,7 +275,7 @@ def test_an_observation_that_is_not_finite_is_refused(key: str) -> None:
     env = FollowTheLeader(4)
     model, observation = make(env), env.reset()
     observation[key][:] = np.nan
-    with pytest.raises(InputError, match="not finite: its weights or the observations are not; look for NaN"):
+    with pytest.raises(InputError, match="not finite: its weights or observations are too large or NaN"):
         model.predict(observation, deterministic=True)
 
 

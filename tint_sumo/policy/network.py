@@ -270,7 +270,7 @@ class GruPolicy(ActorCriticPolicy):
             outputs, _ = self._run(obs, states, episode_starts)
             latent_actor = self.mlp_extractor.forward_actor(outputs)
             latent_critic = self._latent_critic(obs, outputs)
-        distribution = self._get_action_dist_from_latent(latent_actor.float())
+        distribution = self._finite_distribution(latent_actor)
         return self.value_net(latent_critic.float()), distribution.log_prob(actions), distribution.entropy()
 
     def predict_values(self, obs: PyTorchObs, states: Tensor, episode_starts: Tensor) -> Tensor:  # type: ignore[override]
@@ -294,11 +294,17 @@ class GruPolicy(ActorCriticPolicy):
         """The distribution of actions from the actor's last hidden layer.
 
         Raises:
-            FloatingPointError: that is not finite.
+            FloatingPointError: that, or what the distribution is made of, is not finite.
         """
+        problem = FloatingPointError(
+            "the policy's outputs are not finite: its weights or observations are too large or NaN"
+        )
         if not latent_actor.isfinite().all():
-            raise FloatingPointError("the policy's outputs are not finite: its weights or the observations are not")
-        return self._get_action_dist_from_latent(latent_actor.float())
+            raise problem
+        try:
+            return self._get_action_dist_from_latent(latent_actor.float())
+        except ValueError:  # torch has looked at the distribution's parameters
+            raise problem from None
 
     @torch.no_grad()
     def predict(
@@ -330,7 +336,7 @@ class GruPolicy(ActorCriticPolicy):
         try:
             distribution, states = self.get_distribution(obs, states, torch.as_tensor(starts, device=self.device))
         except FloatingPointError as error:
-            raise InputError(f"{error}; look for NaN and infinity in both") from None
+            raise InputError(f"{error}; give others") from None
         actions = distribution.get_actions(deterministic=deterministic).view(-1, *self._action_shape()).cpu().numpy()
         if isinstance(self.action_space, spaces.Box):
             actions = np.clip(actions, self.action_space.low, self.action_space.high)

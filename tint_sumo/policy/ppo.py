@@ -224,9 +224,12 @@ class RecurrentPPO(OnPolicyAlgorithm):
 
     def _update(self, batch: Sequences) -> dict[str, float]:
         """One gradient step; returns what is worth logging."""
-        values, log_probs, entropies = self.policy.evaluate_actions(
-            batch.observations, batch.actions, batch.states, batch.episode_starts
-        )
+        try:
+            values, log_probs, entropies = self.policy.evaluate_actions(
+                batch.observations, batch.actions, batch.states, batch.episode_starts
+            )
+        except FloatingPointError as error:
+            raise self._diverged(str(error)) from None
         decisions = Decisions(log_probs, batch.log_probs, batch.advantages, values.flatten(), batch.returns, entropies)
         loss = ppo_loss(decisions, clip_range=self.clip_range, ent_coef=self.ent_coef, vf_coef=self.vf_coef)
         self.policy.optimizer.zero_grad()

@@ -13,8 +13,11 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from tests.envs.test_workers import assert_infos_equal
 from tint_sumo import ENV_IDS
 from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.envs.batch import LocalBatch
+from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION
+from tint_sumo.simulation.ego import Collision
 
 ENV_ID = ENV_IDS[T_INTERSECTION]
 GO, STOP = 2, 0
@@ -137,3 +140,15 @@ def test_without_autoreset_ended_episodes_take_no_step() -> None:
 def test_an_unknown_mode_is_refused() -> None:
     with pytest.raises(InputError, match="unknown autoreset_mode 'never'; choose one of 'NextStep', 'SameStep', 'Dis"):
         SceneVectorEnv(2, autoreset_mode="never")
+
+
+@pytest.mark.parametrize("outcome", OUTCOMES)
+def test_a_collision_is_told_only_of_an_episode_that_it_ended(outcome: str) -> None:
+    """An ego whose episode has ended otherwise may still be hit while others go on in the same decision."""
+    with closing(SceneVectorEnv(1, time_limit_s=1.0)) as env:
+        env.reset(seed=0)
+        assert isinstance(env.batch, LocalBatch)
+        episodes = env.batch.episodes
+        episodes.simulation.egos.collision[0] = Collision(0, 0, "lower", 1.0, 2.0)
+        episodes.rows["outcome"] = OUTCOMES.index(outcome) + 1
+        assert bool(episodes.collision_info(0)) is (outcome == "collision")

@@ -42,6 +42,7 @@ COMMAND_LINES = (
     "study scenes",
     "render --model oracle --out film.gif --case 3",
     "bench --quick",
+    "models vae",
 )
 
 

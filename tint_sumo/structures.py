@@ -47,7 +47,12 @@ class FieldError(InputError):
 
 def dotted(where: Where) -> str:
     """The way to a value for people, such as ``budget.seeds[0]``."""
-    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where).removeprefix(".")
+    parts = (f"[{part}]" if isinstance(part, int) else f".{_in_one_line(part)}" for part in where)
+    return "".join(parts).removeprefix(".")
+
+
+def _in_one_line(name: str) -> str:
+    return name if name.isprintable() else repr(name)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from tint_sumo.envs.episodes import (
     action_space,
     episode_seed,
     observation_space,
-    require_actions,
     require_arguments,
 )
 from tint_sumo.envs.rows import NOBODY
@@ -114,13 +113,6 @@ def test_arguments_are_those_of_the_environment_and_of_the_task() -> None:
     for name in ("task", "self", "tau"):
         with pytest.raises(InputError, match=name):
             require_arguments(Environment, {name: 1.0})
-
-
-@pytest.mark.parametrize("actions", [[0, 3], [-1, 0], [0], [0, 1, 2], [[0, 1]], [3, 3]])
-def test_actions_that_do_not_exist_are_refused(actions: Any) -> None:
-    require_actions(np.array([0, 2]), 2, 3)
-    with pytest.raises(InputError, match="actions must be 2 of 0, 1, 2, not "):
-        require_actions(np.array(actions), 2, 3)
 
 
 def test_episodes_have_seeds_over_the_whole_range() -> None:

@@ -22,6 +22,7 @@ from tint_sumo.checkpoints import CHECKPOINT_FILE
 from tint_sumo.cli import main
 from tint_sumo.config import TraitSettings
 from tint_sumo.dataset.recorder import record
+from tint_sumo.files import shipped
 from tint_sumo.stores import name_in
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.evaluation import Case, Evaluation
@@ -258,9 +259,20 @@ def test_dataset_inspect(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert f"wrote {tmp_path / 'figure.png'}" in text
 
 
-def test_policy_train(tmp_path: Path, trait_model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture(scope="session")
+def small_training(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A configuration whose rollouts take a moment."""
+    file = tmp_path_factory.mktemp("small") / "config.yaml"
+    file.write_text("budget: {n_envs: 8, n_steps: 16, n_minibatches: 2}\n")
+    return file
+
+
+def test_policy_train(
+    tmp_path: Path, trait_model: Path, small_training: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "run"
-    argv = ("policy", "train", "--method", "vae", "--steps", 1, "--traits", trait_model, "--out", out)
+    train = ("policy", "train", "--method", "vae", "--config", small_training)
+    argv = (*train, "--steps", 1, "--traits", trait_model, "--out", out)
     printed = run(capsys, *argv, "--p-conservative", 0.25)
     assert printed == {
         "model": str(out / "policy.safetensors"), "method": "vae", "p_conservative": [0.25], "steps": 1, "seed": 0
@@ -272,9 +284,12 @@ def test_policy_train(tmp_path: Path, trait_model: Path, capsys: pytest.CaptureF
     assert found["p_conservative"] == [0.25, 0.25]
 
 
-def test_a_pickled_policy_is_read_on_request_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pickled_policy_is_read_on_request_alone(
+    tmp_path: Path, small_training: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "run"
-    run(capsys, "policy", "train", "--method", "oracle", "--steps", 1, "--zip", "--out", out)
+    train = ("policy", "train", "--method", "oracle", "--config", small_training)
+    run(capsys, *train, "--steps", 1, "--zip", "--out", out)
     argv = ("policy", "evaluate", "--model", out / "policy.zip", "--episodes", 2)
     assert "--allow-pickle if you trust the file" in refuse(capsys, *argv)
     assert main([*map(str, argv), "--allow-pickle"]) == 0
@@ -466,9 +481,10 @@ def test_damaged_models(dataset: Path, trait_model: Path, tmp_path: Path, capsys
     broken = copy(trait_model.parent, tmp_path / "broken")
     (broken / "model.safetensors").write_bytes(b"nonsense")
     assert "damaged" in refuse(capsys, "traits", "evaluate", "--data", dataset, "--model", broken)
-    run(capsys, "policy", "train", "--method", "oracle", "--steps", 1, "--out", tmp_path / "run")
-    (tmp_path / "run" / "policy.safetensors").write_bytes(b"nonsense")
-    assert "damaged" in refuse(capsys, "policy", "evaluate", "--model", tmp_path / "run")
+    policy = tmp_path / "policy.safetensors"
+    policy.write_bytes(b"nonsense")
+    policy.with_suffix(".json").write_bytes((shipped("models") / "policies" / "oracle.json").read_bytes())
+    assert "damaged" in refuse(capsys, "policy", "evaluate", "--model", policy)
 
 
 # Interruption
@@ -500,8 +516,11 @@ class Started:
         return look(self.terminal, PATIENCE_S)
 
 
-def test_an_interrupted_training_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    argv = ("policy", "train", "--method", "oracle", "--steps", 30_000, "--out", tmp_path / "run")
+def test_an_interrupted_training_goes_on(
+    tmp_path: Path, small_training: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train = ("policy", "train", "--method", "oracle", "--config", small_training)
+    argv = (*train, "--steps", 6_400, "--out", tmp_path / "run")
     printed = Started(*argv).interrupt_at(r"[1-9]\d*% ", signal.SIGTERM)
     assert "Traceback" not in printed
     assert "tint-sumo: interrupted" in printed

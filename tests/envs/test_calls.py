@@ -185,3 +185,19 @@ def test_a_mask_needs_episodes_that_have_begun() -> None:
         with pytest.raises(InputError, match="no episode has begun"):
             vector.reset(options={"reset_mask": np.array([True, False])})
         vector.reset(options={"reset_mask": np.array([True, True])})
+
+
+@pytest.mark.parametrize("options", [{"resetmask": np.array([True, False])}, {1: 2}, ["reset_mask"], "reset_mask"])
+def test_unknown_options_of_a_reset_are_refused(options: Any, env: SceneEnv, vector: SceneVectorEnv) -> None:
+    with pytest.raises(InputError, match=r"option.*this environment knows none") as refused:
+        env.reset(options=options)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(InputError, match=r"option.*known are: reset_mask"):
+        vector.reset(options=options)
+
+
+def test_a_reset_without_options_may_say_so(env: SceneEnv, vector: SceneVectorEnv) -> None:
+    """As gymnasium's checker and its vector environments do."""
+    first = env.reset(seed=3)[0]
+    assert_equal(env.reset(seed=3, options={})[0], first)
+    assert_equal(vector.reset(seed=3, options={})[0], vector.reset(seed=3)[0])

@@ -1,6 +1,7 @@
 """What callers may ask of an environment, and when: checked before anything is done."""
 
 import operator
+from collections.abc import Mapping
 from enum import Enum
 from typing import Any
 
@@ -85,6 +86,21 @@ def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
     if len(seeds) != num_envs:
         raise InputError(f"{len(seeds)} seeds do not fit {num_envs} environments; give one number or as many")
     return seeds
+
+
+def checked_options(options: Any, known: tuple[str, ...] = ()) -> Mapping[str, Any]:
+    """Return the options of a reset; none where they are None.
+
+    Raises:
+        InputError: they are no dictionary, or one of them is not known.
+    """
+    allowed = f"known are: {', '.join(known)}" if known else "this environment knows none"
+    if options is not None and not isinstance(options, Mapping):
+        raise InputError(f"options must be a dictionary or None, not {_shown(options)}; {allowed}")
+    unknown = [name for name in options or () if name not in known]
+    if unknown:
+        raise InputError(f"there is no reset option {_shown(unknown[0])}; {allowed}")
+    return options or {}
 
 
 def checked_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Snapshot
-from tint_sumo.envs.calls import Phase, checked_actions, checked_seed, require_episode, require_open
+from tint_sumo.envs.calls import Phase, checked_actions, checked_options, checked_seed, require_episode, require_open
 from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_arguments
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, Observation, fields_of, start_info, step_info
@@ -157,12 +157,15 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._spec = spec and replace(spec, max_episode_steps=self._max_episode_steps)
 
     def reset(
-        self,
-        *,
-        seed: int | None = None,
-        options: dict[str, Any] | None = None,  # noqa: ARG002 - gymnasium's signature; there are none
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
+        """Start a new episode; there are no options.
+
+        Raises:
+            InputError: the seed is none, or options are given.
+        """
         require_open(self._phase)
+        checked_options(options)
         super().reset(seed=checked_seed(seed))
         self._play(())
         self._show()

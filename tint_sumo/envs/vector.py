@@ -16,6 +16,7 @@ from tint_sumo.envs.calls import (
     Phase,
     checked_actions,
     checked_mask,
+    checked_options,
     checked_seeds,
     require_episode,
     require_open,
@@ -129,12 +130,12 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         """Start a new episode in every environment, or in those of ``options["reset_mask"]``.
 
         Raises:
-            InputError: a seed or the mask does not fit; or the mask leaves out environments that have no episode yet,
-                or whose last call has failed or was interrupted.
+            InputError: a seed, an option or the mask does not fit; or the mask leaves out environments that have no
+                episode yet, or whose last call has failed or was interrupted.
         """
         require_open(self._phase)
         seeds = checked_seeds(seed, self.num_envs)
-        mask = checked_mask((options or {}).get("reset_mask"), self.num_envs)
+        mask = checked_mask(checked_options(options, ("reset_mask",)).get("reset_mask"), self.num_envs)
         if not mask.all():
             require_episode(self._phase)
         if self._phase is Phase.BUSY:  # nobody knows how much of an interrupted call was done

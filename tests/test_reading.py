@@ -1,17 +1,25 @@
 """Files that are no files: pipes, devices, folders, and files that are too large."""
 
+import gzip
 import os
+import random
 import resource
 import shutil
 import subprocess
 import sys
+import time
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tint_sumo.dataset.fcd_reading import read_fcd
 from tint_sumo.errors import InputError
 from tint_sumo.files import shipped
-from tint_sumo.reading import open_file, read_file
+from tint_sumo.reading import open_file, read_file, require_file
+from tint_sumo.scenes.own import read_net
 
 # Commands that read FILE, or a folder with FILE in it.
 COMMANDS = (
@@ -56,6 +64,41 @@ def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
         with pytest.raises(InputError):
             open_file(tmp_path, "thing", 100)
     assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+def test_gzipped_files_are_refused_by_what_they_unpack_to(tmp_path: Path) -> None:
+    """A file of some size of its own may unpack to much; one that is all zeros may not, whoever reads it."""
+    plain = random.Random(0).randbytes(2**12) + b"\0" * 2**16
+    good = tmp_path / "good.gz"
+    good.write_bytes(gzip.compress(plain))
+    require_file(good, "thing", len(plain))
+    with pytest.raises(InputError, match=rf"thing: .*good\.gz unpacks to more than {len(plain) - 1:,} bytes or"):
+        require_file(good, "thing", len(plain) - 1)
+    good.write_bytes(gzip.compress(plain)[:-9])
+    require_file(good, "thing", len(plain))  # damaged: its reader says so
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "read"),
+    [
+        ("fcd.xml.gz", b"<fcd-export>", read_fcd),
+        ("fcd.csv.gz", b"timestep_time;vehicle_id;vehicle_lane;vehicle_pos;vehicle_speed\n", read_fcd),
+        ("a.net.xml.gz", b"<net>", read_net),
+    ],
+)
+def test_a_gzip_bomb_is_refused_at_once(name: str, start: bytes, read: Callable[[Path], Any], tmp_path: Path) -> None:
+    """2 GB of spaces; members of a gzipped file may follow each other."""
+    file, spaces = tmp_path / name, gzip.compress(b" " * 2**26)
+    file.write_bytes(gzip.compress(start) + spaces * 32)
+    began = time.process_time()
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"unpacks to more than .* or 200 times its size") as refused:
+        read(file)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "\n" not in str(refused.value)
+    assert time.process_time() - began < 1.0
+    assert peak_bytes < 2**25
 
 
 @pytest.mark.slow

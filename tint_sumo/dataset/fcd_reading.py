@@ -9,14 +9,14 @@ import zlib
 from array import array
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, Literal, cast
 from xml.parsers import expat
 
 import numpy as np
 import pandas as pd
 
 from tint_sumo.errors import InputError
-from tint_sumo.reading import TABLE_BYTES, require_file
+from tint_sumo.reading import TABLE_BYTES, is_gzipped, require_file
 
 _NAMES = {  # names of the columns in SUMO's tables
     "timestep_time": "time_s",
@@ -59,7 +59,10 @@ def _read_table(file: Path) -> pd.DataFrame:
     if file.suffix == ".parquet":
         rows = pd.read_parquet(file, columns=list(_NAMES))
     else:
-        rows = pd.read_csv(file, sep=";", usecols=list(_NAMES), dtype={"vehicle_id": str, "vehicle_lane": str})
+        with file.open("rb") as raw:
+            packing: Literal["gzip"] | None = "gzip" if is_gzipped(raw) else None  # pandas knows others, too
+            ids = {"vehicle_id": str, "vehicle_lane": str}
+            rows = pd.read_csv(raw, sep=";", usecols=list(_NAMES), dtype=ids, compression=packing)
     rows = rows.rename(columns=_NAMES)[list(_NAMES.values())]
     rows = rows[rows["vehicle"].notna()]  # an empty timestep is a row of its own
     kinds = {**dict.fromkeys(_NUMBERS, "float64"), **dict.fromkeys(_IDS, "category")}
@@ -69,9 +72,7 @@ def _read_table(file: Path) -> pd.DataFrame:
 def _read_xml(file: Path) -> pd.DataFrame:
     reader = _XmlReader(file)
     with file.open("rb") as raw:
-        zipped = raw.read(2) == b"\x1f\x8b"
-        raw.seek(0)
-        reader.read(cast("IO[bytes]", gzip.GzipFile(fileobj=raw)) if zipped else raw)
+        reader.read(cast("IO[bytes]", gzip.GzipFile(fileobj=raw)) if is_gzipped(raw) else raw)
     return reader.rows()
 
 

@@ -223,6 +223,20 @@ def test_a_path_stands_for_itself(tmp_path: Path) -> None:
         assert folder == Path("run")
 
 
+@pytest.mark.parametrize(
+    ("url", "name"),
+    [
+        ("file:///DISK/runs/paper", "paper"),
+        ("file:///DISK/runs/paper%20two/", "paper two"),
+        ("file:///DISK/runs/.hidden", "hidden"),
+        (f"file:///DISK/{'long' * 50}", "long" * 15),
+    ],
+)
+def test_a_working_folder_is_called_as_the_folder_at_the_url(url: str, name: str, tmp_path: Path) -> None:
+    with working_folder(url.replace("/DISK", str(tmp_path))) as folder:
+        assert folder.name == name  # the name of a study, in the title of its report
+
+
 def test_a_working_folder_begins_with_the_files_of_the_store_and_leaves_them_there(url: str) -> None:
     with working_folder(url) as folder:
         assert list(folder.iterdir()) == []

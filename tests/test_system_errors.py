@@ -4,6 +4,7 @@ import os
 import resource
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ import pytest
 from tint_sumo import files
 from tint_sumo.cli import main
 from tint_sumo.dataset.recorder import record
+from tint_sumo.scenes import network
+from tint_sumo.scenes.network import build_network
 
 PROGRAM = (sys.executable, "-m", "tint_sumo.cli")
 DISK_BYTES = 4_000_000
@@ -180,6 +183,33 @@ def test_a_disk_that_gets_full_leaves_whole_files_alone(
         pq.read_table(shard)
     filler.unlink()
     assert main(words) == 0
+
+
+@pytest.mark.parametrize("left_bytes", [0, 4_096, 16_384, 24_576, 32_768])  # netconvert reports success on all of them
+def test_a_full_temporary_folder_is_told_before_half_a_network_is_used(
+    left_bytes: int, disk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build_network.cache_clear()
+    monkeypatch.setattr(tempfile, "tempdir", str(disk))
+    filler = fill(disk, left_bytes)
+    argv = ["net", "--out", str(tmp_path / "net"), "--scene", "four_way", "--replicas", "8"]
+    assert main(argv) == 1
+    require_one_line(capsys.readouterr().err, "No space left on device; free some space, or choose another folder")
+    assert not (tmp_path / "net").exists()
+    filler.unlink()
+    assert main(argv) == 0  # nothing of the failure is remembered
+
+
+def test_a_netconvert_that_fails_is_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build_network.cache_clear()
+    program = tmp_path / "netconvert"
+    program.write_text("#!/bin/sh\necho 'Error: no room.' >&2; echo 'Quitting (on error).' >&2; exit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(network, "sumo_program", lambda _: str(program))
+    assert main(["net", "--out", str(tmp_path / "net")]) == 1
+    require_one_line(capsys.readouterr().err, "netconvert failed: Error: no room. Quitting (on error).")
 
 
 @pytest.mark.parametrize("files_open", [8, 10, 12])

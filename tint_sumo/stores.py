@@ -27,6 +27,7 @@ _OPTIONS = {
     "s3": {"allow_delayed_open": "true"},  # a small file is one request; nothing is left of one that breaks off
     "gs": {"retry_limit_seconds": "10"},  # without credentials Arrow would try for a quarter of an hour
 }
+_NAME_LENGTH = 60  # characters; file systems take 255 bytes, and a character has up to four
 _ADVICE = {
     "s3": "check the bucket, the connection (AWS_ENDPOINT_URL) and the credentials "
     "(AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile of the AWS command line)",
@@ -81,6 +82,12 @@ class Store:
             raise InputError(redact(f"cannot read {self.url}: there is no bucket {bucket!r}; make it first"))
         sizes = {info.path.removeprefix(base).lstrip("/"): info.size for info in infos}
         return {path: sizes[path] for path in sorted(sizes) if _is_ours(PurePosixPath(path))}
+
+    @property
+    def name(self) -> str:
+        """The last part of the folder's path, or of the bucket's where it is the whole bucket."""
+        with self._reported("read"):
+            return PurePosixPath(self._home[1]).name
 
     def exists(self, path: str) -> bool:
         """Whether there is such a file."""
@@ -172,7 +179,7 @@ def working_folder(out: str | Path, without: tuple[str, ...] = ()) -> Iterator[P
         return
     store = Store(str(out))
     with tempfile.TemporaryDirectory(prefix="tint_sumo_") as home:
-        folder = Path(home) / "out"
+        folder = Path(home) / _folder_name(store.name)
         folder.mkdir()
         for path in store.files():
             if path.split("/")[0] in without:
@@ -188,6 +195,11 @@ def working_folder(out: str | Path, without: tuple[str, ...] = ()) -> Iterator[P
             raise InputError(_renamed(str(error), folder, store.url)) from None
         except JobError as error:
             raise JobError(_renamed(str(error), folder, store.url)) from None
+
+
+def _folder_name(name: str) -> str:
+    """Return a name that every file system takes, the same one wherever possible: reports are titled with it."""
+    return re.sub(r"[^\w .+-]", "_", name).strip(" .")[:_NAME_LENGTH] or "out"
 
 
 def _renamed(message: str, folder: Path, url: str) -> str:

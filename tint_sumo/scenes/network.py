@@ -3,6 +3,8 @@
 Formats: https://sumo.dlr.de/docs/Networks/PlainXML.html
 """
 
+import errno
+import os
 import re
 import subprocess
 import tempfile
@@ -158,7 +160,11 @@ def sumo_program(program: str) -> str:
 
 @lru_cache(maxsize=8)  # copies of an environment, and one that begins anew, need the same network again
 def build_network(sources: PlainXml) -> str:
-    """Run netconvert on the sources and return the text of the network, without its dated header."""
+    """Run netconvert on the sources and return the text of the network, without its dated header.
+
+    Raises:
+        OSError: the system refuses room for temporary files, or something else that netconvert needs.
+    """
     with tempfile.TemporaryDirectory() as folder:
         files = {kind: Path(folder) / f"net.{kind}.xml" for kind in ("nod", "edg", "con", "net")}
         files["nod"].write_text(sources.nodes, encoding="utf-8")
@@ -175,5 +181,8 @@ def build_network(sources: PlainXml) -> str:
         ]
         result = subprocess.run(command, capture_output=True, text=True, check=False)
         if result.returncode != 0:
-            raise RuntimeError(f"netconvert failed: {result.stderr.strip()}")
-        return re.sub(r"<!--.*?-->\s*", "", files["net"].read_text(encoding="utf-8"), flags=re.DOTALL)
+            raise OSError(f"netconvert failed: {result.stderr.strip() or f'it ended with {result.returncode}'}")
+        network = files["net"].read_text(encoding="utf-8")
+    if not network.rstrip().endswith("</net>"):  # netconvert reports success on a full disk, too
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), tempfile.gettempdir())
+    return re.sub(r"<!--.*?-->\s*", "", network, flags=re.DOTALL)

@@ -64,7 +64,9 @@ def test_a_value_survives_the_way_to_a_file_and_back() -> None:
             {"name": "x", "part": {"seeds": [1, "2", "3"]}, "on": 1},
             "part.seeds[1]: must be a whole number, not '2'; also wrong: part.seeds[2], on",
         ),
-        ({"name": "x", "a\nb": 1}, "'a\\nb': there is no such setting; known are name"),
+        ({"name": "x", "part": {"\n": 1}}, "part.'\\n': there is no such setting"),
+        ({"name": "x", "sizes": {"a\tb": 1.5}}, "sizes.'a\\tb': must be a whole number, not 1.5"),
+        ({"name": "x", "k" * 1000: 1}, "'kkkk"),
         ({"name": ["long" * 1000]}, "name: must be text, not ['longlong"),
     ],
 )

@@ -25,7 +25,7 @@ class Range:
         Raises:
             InputError: it is no number in this range.
         """
-        if not isinstance(value, Real) or not self.low <= value <= self.high:  # type: ignore[operator]
+        if isinstance(value, bool) or not isinstance(value, Real) or not self.low <= value <= self.high:  # type: ignore[operator]
             raise InputError(f"must lie in {_digits(self.low)} to {_digits(self.high)}, not {shown(value)}")
         return value
 

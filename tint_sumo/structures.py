@@ -32,6 +32,7 @@ _WORDS = {
     Any: "anything",
 }
 _MOST_OTHERS = 5  # further errors that a message names
+_LONGEST_NAME = 80  # characters
 
 
 class FieldError(InputError):
@@ -47,12 +48,12 @@ class FieldError(InputError):
 
 def dotted(where: Where) -> str:
     """The way to a value for people, such as ``budget.seeds[0]``."""
-    parts = (f"[{part}]" if isinstance(part, int) else f".{_in_one_line(part)}" for part in where)
-    return "".join(parts).removeprefix(".")
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{_printed(part)}" for part in where).removeprefix(".")
 
 
-def _in_one_line(name: str) -> str:
-    return name if name.isprintable() else repr(name)
+def _printed(name: str) -> str:
+    """Return a name as it is, or as Python writes it where a line cannot show it."""
+    return name if name.isprintable() and len(name) <= _LONGEST_NAME else shown(name)
 
 
 @dataclass(frozen=True)

@@ -201,3 +201,34 @@ def test_a_reset_without_options_may_say_so(env: SceneEnv, vector: SceneVectorEn
     first = env.reset(seed=3)[0]
     assert_equal(env.reset(seed=3, options={})[0], first)
     assert_equal(vector.reset(seed=3, options={})[0], vector.reset(seed=3)[0])
+
+
+@pytest.mark.parametrize("count", [0, -1, 2.0, True, None, "2", 10**9, np.float64(2)])
+def test_refused_numbers_of_environments(count: Any) -> None:
+    with pytest.raises(InputError, match=r"^num_envs must be 1 to 100000, not"):
+        SceneVectorEnv(count)
+    if count is not None:
+        with pytest.raises(InputError, match=r"^workers must be 1 to num_envs = 2, not"):
+            SceneVectorEnv(2, workers=count)
+
+
+def test_numpys_integers_are_numbers_of_environments() -> None:
+    with closing(SceneVectorEnv(np.int64(2), workers=np.int8(1))) as vector:
+        assert type(vector.num_envs) is int
+
+
+@pytest.mark.parametrize("snapshot", [None, "x", {}, 3])
+def test_what_is_no_snapshot_is_refused_and_the_episode_goes_on(
+    snapshot: Any, env: SceneEnv, vector: SceneVectorEnv
+) -> None:
+    for one, bad in ((env, snapshot), (vector, snapshot), (vector, [snapshot] * 2)):
+        one.reset(seed=3)
+        with pytest.raises(InputError, match=r"^what snapshot\(\) has returned can be restored, not"):
+            one.restore(bad)
+        one.restore(one.snapshot())
+
+
+@pytest.mark.parametrize("seed", [True, "x", 1.0, -1])
+def test_stable_baselines3s_environment_refuses_bad_seeds(seed: Any) -> None:
+    with pytest.raises(InputError, match=r"^a seed must be an integer"):
+        SceneVecEnv(1, seed=seed)

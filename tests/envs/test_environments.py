@@ -324,5 +324,3 @@ def test_seeds_must_fit_the_environments() -> None:
     with pytest.raises(InputError, match="3 seeds do not fit 2 environments"):
         vector.reset(seed=[1, 2, 3])
     vector.close()
-    with pytest.raises(InputError, match="num_envs must be at least 1"):
-        SceneVectorEnv(0)

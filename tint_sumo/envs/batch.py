@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tint_sumo.envs.episodes import Episodes, TaskSettings
 from tint_sumo.envs.rendering import render_scene
 from tint_sumo.envs.rows import Rows, outcome_name
+from tint_sumo.errors import InputError, shown
 from tint_sumo.timing import StepPart, does
 
 
@@ -35,6 +36,19 @@ class Snapshot:
 
     began: dict[str, Any]  # state of the environment's generator that the seed was drawn from
     actions: tuple[int, ...]
+
+
+def checked_snapshots(snapshots: Any, num_envs: int) -> list[Snapshot]:
+    """Return the snapshots.
+
+    Raises:
+        InputError: they are no sequence of snapshots, one for each environment.
+    """
+    if not isinstance(snapshots, Sequence) or not all(isinstance(one, Snapshot) for one in snapshots):
+        raise InputError(f"what snapshot() has returned can be restored, not {shown(snapshots)}")
+    if len(snapshots) != num_envs:
+        raise InputError(f"{len(snapshots)} snapshots do not fit {num_envs} environments; give as many")
+    return list(snapshots)
 
 
 class Batch(Protocol):

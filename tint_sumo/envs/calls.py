@@ -34,6 +34,18 @@ def require_episode(phase: Phase) -> None:
         raise InputError(phase.value)
 
 
+def checked_count(name: str, value: Any, low: int, high: int, limit: str = "") -> int:
+    """Return a number of things as Python's integer; ``limit`` names the highest one in the message.
+
+    Raises:
+        InputError: it is no integer from ``low`` to ``high``.
+    """
+    number = _integer(value)
+    if number is None or not low <= number <= high:
+        raise InputError(f"{name} must be {low} to {limit}{high}, not {_shown(value)}")
+    return number
+
+
 def checked_actions(actions: Any, shape: tuple[int, ...], choices: int) -> NDArray[np.integer]:
     """Return actions as an array of this shape, () for one environment or (N,).
 
@@ -63,11 +75,8 @@ def checked_seed(seed: Any) -> int | None:
     """
     if seed is None:
         return None
-    try:
-        number = -1 if _as_array(seed).dtype.kind == "b" else operator.index(seed)
-    except TypeError:
-        number = -1
-    if number < 0:
+    number = _integer(seed)
+    if number is None or number < 0:
         raise InputError(f"a seed must be an integer of at least 0, not {_shown(seed)}")
     return number
 
@@ -118,6 +127,14 @@ def checked_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:
             f"not {_shown(mask)}"
         )
     return array
+
+
+def _integer(value: Any) -> int | None:
+    """Return an integer of Python, numpy or torch as Python's; None where it is none, as booleans are."""
+    try:
+        return None if _as_array(value).dtype.kind == "b" else operator.index(value)
+    except TypeError:
+        return None
 
 
 def _as_array(value: Any) -> NDArray[Any]:

@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from tint_sumo.envs.batch import Snapshot
+from tint_sumo.envs.calls import checked_seed
 from tint_sumo.envs.episodes import require_arguments
 from tint_sumo.envs.rows import end_info, fields_of, observation_of
 from tint_sumo.envs.vector import SceneVectorEnv
@@ -46,6 +47,9 @@ class SceneVecEnv(VecEnv):
         self._actions: NDArray[np.int64] = np.zeros(num_envs, np.int64)
         if seed is not None:
             self.seed(seed)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        return super().seed(checked_seed(seed))
 
     def reset(self) -> VecEnvObs:
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds

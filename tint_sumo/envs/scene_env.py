@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from tint_sumo.envs.batch import Snapshot
+from tint_sumo.envs.batch import Snapshot, checked_snapshots
 from tint_sumo.envs.calls import Phase, checked_actions, checked_options, checked_seed, require_episode, require_open
 from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_arguments
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, require_render_mode
@@ -229,8 +229,12 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
         The episode is simulated once more up to there, which takes as long as it took: SUMO's own saved states do not
         hold all that its vehicles remember, and would not go on to the last bit as the episode did.
+
+        Raises:
+            InputError: it is no snapshot.
         """
         require_open(self._phase)
+        (snapshot,) = checked_snapshots([snapshot], 1)
         self.np_random.bit_generator.state = snapshot.began
         self._play(snapshot.actions)
         self._show()

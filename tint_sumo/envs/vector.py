@@ -11,10 +11,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from tint_sumo.envs.batch import Batch, Ended, LocalBatch, Snapshot
+from tint_sumo.envs.batch import Batch, Ended, LocalBatch, Snapshot, checked_snapshots
 from tint_sumo.envs.calls import (
     Phase,
     checked_actions,
+    checked_count,
     checked_mask,
     checked_options,
     checked_seeds,
@@ -37,6 +38,8 @@ from tint_sumo.envs.rows import (
 from tint_sumo.envs.workers import WorkerBatch
 from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, OwnScene, Scene
+
+MOST_ENVS = 100_000  # environments of one vector: beyond, memory would run out before anything is said
 
 
 class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
@@ -76,10 +79,10 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **task: Any,
     ) -> None:
-        if num_envs < 1:
-            raise InputError(f"num_envs must be at least 1, not {num_envs}")
+        num_envs = checked_count("num_envs", num_envs, 1, MOST_ENVS)
         if isinstance(scene, str | Scene | OwnScene):
-            scenes: Sequence[AnyScene] = [scene] * (1 if workers is None else workers)
+            count = 1 if workers is None else checked_count("workers", workers, 1, num_envs, "num_envs = ")
+            scenes: Sequence[AnyScene] = [scene] * count
         elif workers in (None, len(scene)):
             scenes = scene
         else:
@@ -199,15 +202,14 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         It takes as long as the longest episode so far.
 
         Raises:
-            InputError: there are not as many snapshots as environments.
+            InputError: they are no snapshots, or not as many as environments.
         """
         require_open(self._phase)
-        if len(snapshots) != self.num_envs:
-            raise InputError(f"{len(snapshots)} snapshots do not fit {self.num_envs} environments; give as many")
+        checked = checked_snapshots(snapshots, self.num_envs)
         if self._phase is Phase.BUSY:
             self._stop()
         self._phase = Phase.BUSY
-        self.batch.restore(snapshots)
+        self.batch.restore(checked)
         self._phase = Phase.READY
         return self._shown()
 

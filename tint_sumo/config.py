@@ -46,6 +46,7 @@ WarmUpS = Annotated[float, Range(0.0, 86_400.0)]
 StepS = Annotated[float, Range(0.01, 1.0)]
 Slots = Annotated[int, Range(1, 200)]  # vehicles in an observation
 WindowCount = Annotated[int, Range(1, 100_000_000)]
+LatentCount = Annotated[int, Range(1, 64)]  # of a trait model
 Processes = Annotated[int, Range(1, 1024)]
 Gain = Annotated[float, Range(0.001, 1000.0)]
 Weight = Annotated[float, Range(0.0, 1e6)]  # of a term of a loss
@@ -213,7 +214,7 @@ def is_share(value: object) -> bool:
     """Whether a value is a probability or a range of probabilities."""
     try:
         low, high = ends(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return False
     return 0.0 <= low <= high <= 1.0
 

@@ -9,11 +9,12 @@ from tempfile import TemporaryFile
 from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
+from pydantic_core import from_json
 
 from tint_sumo.errors import InputError
 from tint_sumo.provenance import CONFIG_FILE, PROVENANCE_FILE, made_by, present_origin
 from tint_sumo.reading import JSON_BYTES, read_file
-from tint_sumo.structures import FieldError, build_json
+from tint_sumo.structures import FieldError, build_json, dotted
 
 T = TypeVar("T")
 
@@ -79,26 +80,31 @@ def read_json(path: Path, what: str, most_bytes: int = JSON_BYTES) -> dict[str, 
     """
     text = read_file(path, what, most_bytes)
     try:
-        value = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        value = from_json(text)
+    except ValueError as error:  # also if it is nested too deeply
         raise InputError(f"{what}: {path} is damaged ({error}); make it anew") from None
     if not isinstance(value, dict):
         raise InputError(f"{what}: {path} is damaged (not a JSON object); make it anew")
     return value
 
 
-def read_record(path: Path, what: str, kind: type[T]) -> T:
-    """Read a JSON object as a dataclass.
+def read_record(path: Path, what: str, kind: type[T], most_bytes: int = JSON_BYTES) -> T:
+    """Read a file in JSON as a value of a type: mostly a dataclass.
 
     Raises:
         InputError: the file is missing, too large or damaged, or a value in it does not fit.
     """
-    text = read_file(path, what, JSON_BYTES)
+    text = read_file(path, what, most_bytes)
     try:
         found: T = build_json(kind, text)
     except FieldError as error:
-        raise InputError(f"{what}: {path}: {error}; restore the file or make it anew") from None
+        raise damaged(path, what, error) from None
     return found
+
+
+def damaged(path: Path, what: str, error: object) -> InputError:
+    """Return what to raise where a file of a run does not say what it should."""
+    return InputError(f"{what}: {path} is damaged ({error}); restore it, or remove it and repeat the command")
 
 
 def require_output_file(file: Path, suffixes: Sequence[str], flag: str = "--out") -> None:
@@ -208,7 +214,7 @@ def _require_home(folder: Path, wanted: Mapping[str, Any]) -> None:
     if run_file.exists():
         held = read_json(run_file, "run settings")
         if held != wanted:
-            changed = sorted(key for key in held.keys() | wanted.keys() if held.get(key) != wanted.get(key))
+            changed = sorted(dotted((key,)) for key in held.keys() | wanted.keys() if held.get(key) != wanted.get(key))
             raise InputError(
                 f"{folder} already holds another run (different: {', '.join(changed)}); "
                 "choose another --out or remove the folder"

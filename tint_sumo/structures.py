@@ -29,6 +29,7 @@ _WORDS = {
     Path: "a path",
     NoneType: "null",
     dict: "a mapping",
+    Mapping: "a mapping",
     Any: "anything",
 }
 _MOST_OTHERS = 5  # further errors that a message names

@@ -211,10 +211,12 @@ def test_the_curve_of_a_training_is_one_of_the_study(study: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "decisions,success\n64,1\n", f"{HEADER}64,often,0,0\n", f"{HEADER}64,1,0,0\n1,2,3,4,5\n"]
+    "text",
+    ["", "decisions,success\n64,1\n", f"{HEADER}64,often,0,0\n", f"{HEADER}64,1,0,0\n1,2,3,4,5\n"]
+    + [f"{HEADER}{line}\n" for line in ("64,2,0,0", "64,nan,0,0", "1e300,1,0,0", "-1,1,0,0", "64,1,0,0\n64,1,0,0")],
 )
 def test_damaged_curves_are_named(tmp_path: Path, text: str) -> None:
     write_text(tmp_path / "policies" / "oracle-P0.4-seed0" / CURVE_FILE, text)
-    with pytest.raises(InputError, match=r"curve\.csv is damaged .*; restore or remove it") as refusal:
+    with pytest.raises(InputError, match=r"curve\.csv is damaged .*; restore it, or remove it") as refusal:
         read_curves(tmp_path)
     assert "\n" not in str(refusal.value)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ Observation = dict[str, NDArray[np.float32]]
 OBSERVATION_KEYS = ("ego", "vehicles", "mask")
 TRACKS = ("position_m", "gap_m", "passed")  # per vehicle slot, if they are asked for
 REWARD_TERMS = ("goal", "collision", "speed", "step")
-OUTCOMES = ("success", "timeout", "collision")
+Outcome = Literal["success", "timeout", "collision"]
+OUTCOMES: tuple[str, ...] = get_args(Outcome)
 GOING_ON, _SUCCESS, _TIMEOUT, COLLISION = range(4)  # numbers of outcomes in rows: positions in OUTCOMES, plus 1
 NOBODY = -1  # the trait of an empty slot
 BOUND = 2.0  # limit of normalised observations: 40 m, 6 m/s

@@ -101,6 +101,19 @@ def read_policy_card(stem: Path) -> dict[str, Any]:
     return card
 
 
+def read_versions(stem: Path) -> dict[str, str]:
+    """The versions of the packages that trained a policy, as its card has them; none if it does not say.
+
+    Raises:
+        InputError: as in ``read_policy_card``, or they are no versions.
+    """
+    try:
+        found: dict[str, str] = build(dict[str, str], read_policy_card(stem).get("versions", {}), ("versions",))
+    except FieldError as error:
+        raise InputError(f"{card_file(stem)}: {error}; restore the file") from None
+    return found
+
+
 def weights_file(stem: Path) -> Path:
     return stem.with_name(stem.name + ".safetensors")
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from tint_sumo.errors import InputError
-from tint_sumo.files import read_json, write_json
+from tint_sumo.config import is_share
+from tint_sumo.files import damaged, read_record, write_json
 from tint_sumo.percentages import percent
 from tint_sumo.progress import Progress, Report
 from tint_sumo.reading import RESULT_BYTES
@@ -59,8 +59,11 @@ def read_ceilings(out: Path) -> dict[float, float]:
         InputError: the file is damaged.
     """
     file = out / CEILINGS_FILE
-    found = read_json(file, "ceilings", RESULT_BYTES) if file.exists() else {}
+    found = read_record(file, "ceilings", dict[str, float], RESULT_BYTES) if file.exists() else {}
     try:
-        return {float(p): float(share) for p, share in found.items()}
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{file} is damaged ({error}); remove it and run the study again") from None
+        ceilings = {float(p): share for p, share in found.items()}
+    except ValueError as error:
+        raise damaged(file, "ceilings", error) from None
+    if not all(is_share(share) for one in ceilings.items() for share in one):
+        raise damaged(file, "ceilings", "all numbers must lie in 0 to 1")
+    return ceilings

@@ -3,14 +3,15 @@
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import OUTCOMES, Outcome
 from tint_sumo.errors import InputError
 from tint_sumo.progress import Progress, Report, silent
+from tint_sumo.ranges import Range
 from tint_sumo.study.methods import Policy
 from tint_sumo.study.statistics import Rate
 
@@ -32,6 +33,9 @@ class Case:
     time_s: float  # time of its end
     trait: str | None = None  # trait of the driver that was hit
     route: str | None = None  # route of that driver
+
+
+StoredCase = tuple[Outcome, Annotated[float, Range(0.0, 1e6)], str | None, str | None]  # a case in files
 
 
 @dataclass(frozen=True)

@@ -13,17 +13,24 @@ import torch
 from tint_sumo.errors import InputError
 from tint_sumo.executors import Executor
 from tint_sumo.executors.jobs import THREADS_PER_JOB
-from tint_sumo.files import read_json, write_json
+from tint_sumo.files import read_record, write_json
 from tint_sumo.progress import Report
 from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.scenes import AnyScene, OwnScene, find_scene
 from tint_sumo.standings import Title
-from tint_sumo.study.evaluation import BATCH, Case, Evaluation, evaluate, require_cases
+from tint_sumo.study.evaluation import BATCH, Case, Evaluation, StoredCase, evaluate, require_cases
 from tint_sumo.study.loading import Contender, load_policy
 
 MAX_CASES = 1000  # cases of a job: some 20 seconds' work is lost with a machine
 _MODEL = "model"  # folder of the policy's files
 _SUFFIXES = (".safetensors", ".json", ".zip")
+
+
+@dataclass(frozen=True)
+class _Cases:
+    """What such a job writes."""
+
+    cases: tuple[StoredCase, ...]
 
 
 @dataclass(frozen=True)
@@ -81,7 +88,7 @@ class CasesJob:
 
     def cases(self) -> tuple[Case, ...]:
         """What came out."""
-        return tuple(Case(*one) for one in read_json(self.file, "cases", RESULT_BYTES)["cases"])
+        return tuple(Case(*one) for one in read_record(self.file, "cases", _Cases, RESULT_BYTES).cases)
 
 
 def evaluate_on(

@@ -9,11 +9,11 @@ import torch
 
 from tint_sumo.config import PpoSettings, Share, ends, share_words
 from tint_sumo.envs.rows import OUTCOMES
-from tint_sumo.errors import InputError
 from tint_sumo.executors.jobs import THREADS_PER_JOB
-from tint_sumo.files import write_json
+from tint_sumo.files import damaged, write_json
 from tint_sumo.percentages import percent
 from tint_sumo.progress import Report, part_of
+from tint_sumo.reading import RESULT_BYTES, require_file
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, Scene, find_scene
 from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Conditions, Trials
@@ -225,8 +225,14 @@ def smoothed_percent(seeds: Sequence[pd.DataFrame]) -> pd.DataFrame:
 
 
 def _read_curve(file: Path) -> pd.DataFrame:
+    require_file(file, "training curve", RESULT_BYTES)
     try:
-        return pd.read_csv(file, dtype=float)[["decisions", *OUTCOMES]]
-    except (KeyError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{file} is damaged ({reason}); restore or remove it") from None
+        curve = pd.read_csv(file, dtype=float, compression=None)[["decisions", *OUTCOMES]]
+    except (KeyError, ValueError, OverflowError) as error:
+        raise damaged(file, "training curve", " ".join(str(error).split())) from None
+    decisions, shares = curve["decisions"], curve[list(OUTCOMES)]
+    if not (decisions.between(0, 1e12).all() and decisions.is_monotonic_increasing and decisions.is_unique):
+        raise damaged(file, "training curve", "decisions must grow from 0 on")
+    if not ((shares >= 0.0) & (shares <= 1.0)).all(axis=None):
+        raise damaged(file, "training curve", "shares of outcomes must lie in 0 to 1")
+    return curve

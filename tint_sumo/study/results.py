@@ -1,16 +1,17 @@
 """How the policies of a study fared, as files."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from tint_sumo.config import Idm, Share
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.config import Idm, NoiseM, Seed, Share, TauS, require_share
 from tint_sumo.errors import InputError
-from tint_sumo.files import read_json
+from tint_sumo.files import read_record
+from tint_sumo.ranges import Range
 from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.evaluation import CASES, Case, Evaluation
+from tint_sumo.study.evaluation import CASES, MAX_SEED, Case, Evaluation, StoredCase
 from tint_sumo.study.folders import RESULTS
 
 TRAINED, GIVEN = "trained", "given"  # origin of a policy: the study itself, or a rule or the package
@@ -57,35 +58,57 @@ class Result:
     @classmethod
     def read(cls, file: Path) -> "Result":
         """Raises InputError if the file is damaged."""
-        content = read_json(file, "result of a study", RESULT_BYTES)
-        try:
-            scene_tau_s = float(content.get("scene_tau_s", Idm.tau_s))
-            tested = tuple(
-                Measured(_conditions(one).relative_to(scene_tau_s), _evaluation(one)) for one in content["tested"]
-            )
-            mix, seed, case_set = _share(content["mix"]), int(content["seed"]), int(content.get("case_set", CASES))
-            result = cls(content["method"], content["origin"], mix, seed, tested, case_set, scene_tau_s)
-        except (LookupError, TypeError, ValueError) as error:
-            raise InputError(f"{file} is damaged ({error!r}); remove it and run the study again") from None
-        all_cases = [one.evaluation.cases for one in tested]
-        if not all(all_cases) or any(case.outcome not in OUTCOMES for cases in all_cases for case in cases):
-            raise InputError(f"{file} is damaged (no cases, or unknown outcomes); remove it and run the study again")
-        return result
+        stored = read_record(file, "result of a study", _Stored, RESULT_BYTES)
+        tested = tuple(one.measured(stored.scene_tau_s) for one in stored.tested)
+        return cls(stored.method, stored.origin, stored.mix, stored.seed, tested, stored.case_set, stored.scene_tau_s)
 
 
-def _conditions(one: dict[str, Any]) -> Conditions:
-    share = _share(one["p_conservative"])
-    if share is None:
-        raise ValueError("no p_conservative")
-    return Conditions(share, float(one["position_noise_m"]), float(one["tau_s"]), int(one["percent"]))
+@dataclass(frozen=True)
+class _StoredTest:
+    """What a file says of a test: its conditions, its cases, and what follows from those."""
+
+    p_conservative: Share
+    position_noise_m: NoiseM
+    tau_s: TauS
+    percent: int
+    success: float
+    timeout: float
+    collision: float
+    intervals: Mapping[str, tuple[float, float]]
+    episodes: int
+    navigation_time_s: float | None
+    collisions: Mapping[str, int]
+    cases: tuple[StoredCase, ...]
+
+    def __post_init__(self) -> None:
+        _ = self.conditions  # they are checked
+        if not self.cases:
+            raise InputError("there are no cases")
+
+    @property
+    def conditions(self) -> Conditions:
+        return Conditions(self.p_conservative, self.position_noise_m, self.tau_s, self.percent)
+
+    def measured(self, scene_tau_s: float) -> Measured:
+        evaluation = Evaluation(tuple(Case(*case) for case in self.cases))
+        return Measured(self.conditions.relative_to(scene_tau_s), evaluation)
 
 
-def _evaluation(one: dict[str, Any]) -> Evaluation:
-    return Evaluation(tuple(Case(outcome, float(time_s), *hit) for outcome, time_s, *hit in one["cases"]))
+@dataclass(frozen=True)
+class _Stored:
+    """What a file says of a result."""
 
+    method: str
+    origin: Literal["trained", "given"]
+    mix: Share | None
+    seed: Seed
+    tested: tuple[_StoredTest, ...]
+    case_set: Annotated[int, Range(0, MAX_SEED)] = CASES
+    scene_tau_s: TauS = Idm.tau_s
 
-def _share(value: Any) -> Share | None:
-    return None if value is None else (float(value[0]), float(value[1])) if isinstance(value, list) else float(value)
+    def __post_init__(self) -> None:
+        if self.mix is not None:
+            require_share(self.mix)
 
 
 def read_results(out: Path) -> list[Result]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from tint_sumo.config import Share, share_words
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.errors import InputError
+from tint_sumo.reading import RESULT_BYTES, read_file
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.rows import Summary
 from tint_sumo.study.statistics import Interval
@@ -88,17 +89,15 @@ def read_csv(file: Path) -> tuple[list[StoredRow], dict[float, float]]:
     Raises:
         InputError: there is no such file, or it is another kind of table.
     """
+    content = read_file(file, "results", RESULT_BYTES)
     try:
-        with file.open(newline="", encoding="utf-8") as lines:
-            table = list(csv.DictReader(lines, strict=True))
+        table = list(csv.DictReader(io.StringIO(content.decode(), newline=""), strict=True))
         if not table:
             raise ValueError("no rows")
         rows = [_row(line) for line in table]
         stated = [line for line in table if line["ceiling_percent"]]
         ceilings = {float(line["p_conservative"]): _read_percent(line["ceiling_percent"]) for line in stated}
-    except OSError as error:
-        raise InputError(f"{file} cannot be read: {error.strerror}") from None
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, csv.Error) as error:
         raise InputError(f"{file} is no results.csv of a study ({error!r})") from None
     return rows, ceilings
 

@@ -10,12 +10,12 @@ import pandas as pd
 import torch
 
 from tint_sumo import traits
-from tint_sumo.config import NoiseM, Seed, TrafficSeed, TraitSettings, WindowCount
+from tint_sumo.config import Fraction, NoiseM, Seed, TrafficSeed, TraitSettings, WindowCount
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, joined, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.executors import Job, Workers, executor_of
 from tint_sumo.executors.jobs import THREADS_PER_JOB
-from tint_sumo.files import claim_folder, read_json, write_json, write_text
+from tint_sumo.files import claim_folder, read_record, write_json, write_text
 from tint_sumo.percentages import percent
 from tint_sumo.progress import Report
 from tint_sumo.ranges import require_ranges
@@ -197,10 +197,32 @@ class TransferJob:
         return windows, split_by_episode(windows, TEST_FRACTION, self.seed)[int(test)]
 
 
+@dataclass(frozen=True)
+class _SceneScore:
+    """How a model fared in a scene."""
+
+    scene: str
+    accuracy: Fraction
+    speed_r2: float
+
+
+@dataclass(frozen=True)
+class _Transfer:
+    """What a job writes: how its model fared in each scene."""
+
+    method: str
+    trained_on: str
+    seed: Seed
+    scenes: tuple[_SceneScore, ...]
+
+
 def _report(out: Path) -> pd.DataFrame:
-    found = [read_json(file, "result of the study", RESULT_BYTES) for file in sorted((out / RESULTS).glob("*.json"))]
-    keys = ("method", "trained_on", "seed")
-    table = pd.DataFrame([{key: one[key] for key in keys} | row for one in found for row in one["scenes"]])
+    files = sorted((out / RESULTS).glob("*.json"))
+    found = [read_record(file, "result of the study", _Transfer, RESULT_BYTES) for file in files]
+    rows = [(one, asdict(row)) for one in found for row in one.scenes]
+    table = pd.DataFrame(
+        [{"method": one.method, "trained_on": one.trained_on, "seed": one.seed, **row} for one, row in rows]
+    )
     write_text(out / "scenes.csv", table.to_csv(index=False))
     write_text(out / "scenes.md", report_markdown(table))
     return table

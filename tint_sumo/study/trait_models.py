@@ -216,7 +216,7 @@ def _require_unseen(data: Path, model: str | Path) -> None:
     trained_on = read_card(model).get("data") or {}
     here = describe(data)
     alike = all(trained_on.get(key) == here[key] for key in ("scene", "p_conservative", "population", "seed"))
-    if alike and trained_on["windows"] != here["windows"]:
+    if alike and trained_on.get("windows") != here["windows"]:
         raise InputError(
             f"{data} has episodes that {model} was trained on; record another dataset with --seed {here['seed'] + 1}"
         )

@@ -1,6 +1,7 @@
 """Table and figure of the comparison of trait methods, from the results of its jobs."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,13 +9,43 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
+from tint_sumo.config import Fraction, LatentCount, NoiseM, Seed, WindowCount
 from tint_sumo.errors import InputError
-from tint_sumo.files import read_json, whole_file, write_text
+from tint_sumo.files import damaged, read_json, whole_file, write_text
 from tint_sumo.percentages import percent
 from tint_sumo.reading import RESULT_BYTES
+from tint_sumo.structures import FieldError, build, require_known
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.methods import look_of_encoder
 from tint_sumo.study.tables import markdown_table
+from tint_sumo.traits.evaluation import TraitAccuracy
+
+_WHAT = "result of a trait study"
+
+
+@dataclass(frozen=True)
+class _Comparison(TraitAccuracy):
+    """How well one training of a method tells the traits apart."""
+
+    method: str
+    noise_m: NoiseM
+    seed: Seed
+    training_windows: WindowCount
+    training_s: float | None
+    by_p: Mapping[str, Fraction]
+
+
+@dataclass(frozen=True)
+class _Continuous:
+    """How well one training of a method gives what drivers without classes were drawn with."""
+
+    method: str
+    latent_size: LatentCount
+    seed: Seed
+    r2: Mapping[str, float]
+
+
+_KINDS = {"comparison": _Comparison, "continuous": _Continuous}
 
 
 @dataclass(frozen=True)
@@ -51,13 +82,20 @@ def write_trait_report(out: Path) -> TraitReport:
 
 def _read_results(out: Path) -> list[dict[str, Any]]:
     files = sorted((out / RESULTS).glob("*.json"))
-    contents = [read_json(file, "result of a trait study", RESULT_BYTES) for file in files]
-    for file, content in zip(files, contents, strict=True):
-        if content.get("kind") not in ("comparison", "continuous"):
-            raise InputError(f"{file} is not a result of a trait study; remove it and run the study again")
+    contents = [_read_result(file) for file in files]
     if not any(content["kind"] == "comparison" for content in contents):
         raise InputError(f"no results in {out}; run the study first: tint-sumo traits study --out {out}")
     return contents
+
+
+def _read_result(file: Path) -> dict[str, Any]:
+    content = read_json(file, _WHAT, RESULT_BYTES)
+    try:
+        kind = require_known(content.get("kind"), _KINDS, ("kind",))
+        build(_KINDS[kind], {key: value for key, value in content.items() if key != "kind"})
+    except FieldError as error:
+        raise damaged(file, _WHAT, error) from None
+    return content
 
 
 def _flat(content: dict[str, Any]) -> dict[str, Any]:
@@ -128,7 +166,7 @@ def _parts_table(table: pd.DataFrame) -> str:
     measures |= {name.removeprefix("svc_").removesuffix("_percent"): name for name in others}
     lines = [["method", "noise (m)", *measures]]
     for row in table.to_dict("records"):
-        cells = ["-" if pd.isna(row[name]) else percent(row[name] / 100.0, 2) for name in measures.values()]
+        cells = ["-" if pd.isna(row.get(name)) else percent(row[name] / 100.0, 2) for name in measures.values()]
         lines.append([str(row["method"]), f"{row['noise_m']:g}", *cells])
     return (
         markdown_table(lines)

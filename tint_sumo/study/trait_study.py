@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 import torch
 
-from tint_sumo.config import Fraction, NoiseM, Seed, TraitSettings, WindowCount
+from tint_sumo.config import Fraction, LatentCount, NoiseM, Seed, TraitSettings, WindowCount
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.errors import InputError
@@ -28,7 +28,6 @@ from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.storage import RUN_MODEL, add_to_card
 
 DATASET_SEED = 2022
-Latents = Annotated[int, Range(1, 64)]
 PROPERTIES = ("desired_speed_mps", "min_gap_m")
 _DATA, _CONTINUOUS_DATA = "dataset", "continuous"  # folders in a comparison's folder
 
@@ -47,7 +46,7 @@ class TraitStudy:
     other_windows: WindowCount = 30_000
     continuous_windows: WindowCount = 240_000
     continuous_methods: Many[str] = ("vae", "cross_window")
-    continuous_latents: Many[Latents] = (2, 4)
+    continuous_latents: Many[LatentCount] = (2, 4)
     continuous_seeds: Many[Seed] = (0, 1)
     continuous_epochs: Annotated[int, Range(1, 1_000_000)] = 10  # properties without classes take longer to show
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -12,8 +13,10 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
+from tint_sumo.config import Fraction, WindowCount
 from tint_sumo.dataset.windows import Windows, split_by_episode
 from tint_sumo.errors import InputError
+from tint_sumo.ranges import Range
 from tint_sumo.traits.batches import TrainingWindows
 from tint_sumo.traits.model import TraitModel
 
@@ -28,18 +31,18 @@ ENCODING_BATCH = 1024  # keeps a step of the network in the processor's cache
 class Part:
     """Accuracy on a part of the test windows; None where there are none."""
 
-    accuracy: float | None
-    windows: int
+    accuracy: Fraction | None
+    windows: Annotated[int, Range(0, 100_000_000)]
 
 
 @dataclass(frozen=True)
 class TraitAccuracy:
     """How well the latent mean tells the traits apart, on windows of unseen episodes."""
 
-    accuracy: float  # share of windows that a linear support vector classifier gets right
-    knn_accuracy: float  # the same of the nearest neighbours in the latent space
-    majority_share: float  # what one gets right who always takes the most frequent trait
-    windows: int
+    accuracy: Fraction  # share of windows that a linear support vector classifier gets right
+    knn_accuracy: Fraction  # the same of the nearest neighbours in the latent space
+    majority_share: Fraction  # what one gets right who always takes the most frequent trait
+    windows: WindowCount
     error_m: float | None  # root mean square of reconstructed or predicted positions; None if the method has none
     # Share of the linear classifier's errors; None without errors or with point estimates.
     errors_in_most_uncertain_tenth: float | None

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
-from tint_sumo.config import TraitSettings
+from tint_sumo.config import LatentCount, TraitSettings
 from tint_sumo.determinism import preserved_random_state
 from tint_sumo.errors import InputError, refuse_old_name
 from tint_sumo.files import read_json, shipped, write_json
@@ -110,13 +110,15 @@ class _Described:
     """What a card must say of its model; it may say more."""
 
     method: str
-    latent_size: Annotated[int, Range(1, 64)]
+    latent_size: LatentCount
     settings: TraitSettings
+    data: dict[str, Any] | None = None
+    seed: Annotated[int, Range(0, 2**64 - 1)] = 0
 
 
 def _checked_card(stem: Path) -> dict[str, Any]:
     card = read_json(_card_file(stem), "card of the trait model")
-    if card.get("method") not in TRAIT_METHODS:
+    if str(card.get("method")) not in TRAIT_METHODS:
         raise InputError(
             f"{_card_file(stem)} is not the card of a trait model (methods: {', '.join(sorted(TRAIT_METHODS))}); "
             "restore the file or train the model again"

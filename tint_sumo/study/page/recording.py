@@ -5,7 +5,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -13,18 +13,20 @@ from numpy.typing import NDArray
 
 import tint_sumo
 from tint_sumo.config import Share
-from tint_sumo.errors import InputError
+from tint_sumo.envs.rows import Outcome
 from tint_sumo.executors import Workers, executor_of
 from tint_sumo.executors.jobs import THREADS_PER_JOB
-from tint_sumo.files import read_json, write_text
+from tint_sumo.files import damaged, read_json, write_text
 from tint_sumo.policy.storage import read_policy_card, weights_file
 from tint_sumo.progress import Progress, Report, part_of
+from tint_sumo.ranges import Range
 from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
 from tint_sumo.standings import Title
+from tint_sumo.structures import FieldError, build
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.driving import Moment, drive_case
-from tint_sumo.study.evaluation import CASES
+from tint_sumo.study.evaluation import CASES, CASES_PER_SEED
 from tint_sumo.study.loading import Contender, find_policy, load_policy
 from tint_sumo.study.methods import METHODS, Rule
 from tint_sumo.study.policy_jobs import label, policy_folder, policy_path
@@ -49,6 +51,53 @@ UNITS = {
 }
 
 Column = list[int]
+_WHAT = "recorded episodes"
+
+
+@dataclass(frozen=True)
+class _Identity:
+    """What was recorded; compared as a whole with what is wanted."""
+
+    format: int
+    policy: str
+    conditions: dict[str, Any]
+    cases: tuple[Annotated[int, Range(0, CASES_PER_SEED - 1)], ...]
+    scene: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _StoredVehicle:
+    """A vehicle's columns, from its first frame on."""
+
+    number: int
+    trait: int
+    first: Annotated[int, Range(0, 1_000_000)]
+    x_m: tuple[int, ...]
+    y_m: tuple[int, ...]
+    heading_deg: tuple[int, ...]
+    brakes: tuple[int, ...]
+    attention: tuple[int, ...] | None = None
+    p_conservative: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class _StoredEpisode:
+    """What ``encode`` makes of an episode."""
+
+    outcome: Outcome
+    time_s: Annotated[float, Range(0.0, 1e6)]
+    frames: Annotated[int, Range(1, 1_000_000)]
+    ego: dict[str, tuple[int, ...]]
+    routes: dict[str, dict[str, tuple[int, ...]]]
+    vehicles: tuple[_StoredVehicle, ...]
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """What a file of recorded episodes holds, by the number of the case."""
+
+    recorded: _Identity
+    episodes: dict[str, _StoredEpisode]
 
 
 @dataclass(frozen=True)
@@ -110,10 +159,7 @@ class Recording:
         Raises:
             InputError: there is no such policy, or the file is damaged.
         """
-        return (
-            self.file.exists()
-            and read_json(self.file, "recorded episodes", RESULT_BYTES).get("recorded") == self._identity
-        )
+        return self.file.exists() and read_json(self.file, _WHAT, RESULT_BYTES).get("recorded") == self._identity
 
     def make(self, report: Report) -> None:
         contender = self._contender()
@@ -186,11 +232,14 @@ def read_episodes(file: Path) -> dict[int, dict[str, Any]]:
     Raises:
         InputError: the file is missing or damaged.
     """
-    content = read_json(file, "recorded episodes", RESULT_BYTES)
+    content = read_json(file, _WHAT, RESULT_BYTES)
     try:
-        return {int(case): dict(one) for case, one in content["episodes"].items()}
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{file} is damaged ({error!r}); remove it and make the report again") from None
+        found: _Stored = build(_Stored, content)
+    except FieldError as error:
+        raise damaged(file, _WHAT, error) from None
+    if list(found.episodes) != [str(case) for case in found.recorded.cases]:
+        raise damaged(file, _WHAT, "it has other episodes than it says")
+    return {int(case): one for case, one in content["episodes"].items()}
 
 
 def _digest(policy: str | Path) -> str:

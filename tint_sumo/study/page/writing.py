@@ -13,9 +13,11 @@ from typing import Any
 from plotly.offline import get_plotlyjs
 
 import tint_sumo
+from tint_sumo.errors import InputError
 from tint_sumo.executors import Workers
-from tint_sumo.files import RUN_FILE, read_json, write_text
-from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, read_described
+from tint_sumo.files import RUN_FILE, damaged, read_json, write_text
+from tint_sumo.policy.storage import read_versions
+from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION, OwnScene, Scene, read_described
 from tint_sumo.study.page.charts import Chart, curve_chart, outcome_chart, world_charts
 from tint_sumo.study.page.choosing import choose
 from tint_sumo.study.page.episodes import Recordings, failure_lists, player_data, player_notes, record_episodes
@@ -70,20 +72,28 @@ def write_page(report: StudyReport, out: Path, *, workers: Workers = 2, progress
         report.rows,
         {one.heading: one for one in report.tables},
         curve_chart(curves) if curves else None,
-        record_episodes(out, _scene(out), choose(report.rows), workers=workers, progress=progress),
+        record_episodes(out, read_scene_of(out), choose(report.rows), workers=workers, progress=progress),
         read_latents(out, [row.method for row in report.rows], progress=progress),
     )
     write_text(out / PAGE_FILE, _page(study))
     return replace(report, page_file=out / PAGE_FILE)
 
 
-def _scene(out: Path) -> str | Scene:
-    """The scene of the study in ``out``: the paper's, unless its settings name another one."""
+def read_scene_of(out: Path) -> str | Scene:
+    """The scene of the study in ``out``: the paper's, unless its settings name another one.
+
+    Raises:
+        InputError: the settings are damaged.
+    """
     settings = read_json(out / RUN_FILE, "run settings") if (out / RUN_FILE).exists() else {}
     if "scene" not in settings:
         return T_INTERSECTION
-    scene = read_described(settings)
-    assert not isinstance(scene, OwnScene), "studies refuse other scenes"
+    try:
+        scene = read_described(settings)
+    except InputError as error:
+        raise damaged(out / RUN_FILE, "run settings", error) from None
+    if isinstance(scene, OwnScene) or scene == ALL_SCENES:
+        raise damaged(out / RUN_FILE, "run settings", "scene: no study is of such scenes")
     return scene
 
 
@@ -228,8 +238,8 @@ def _versions(out: Path) -> Lines:
     """Versions of the packages that trained the policies; all of them where policies differ."""
     found: dict[str, dict[str, None]] = {}
     for file in sorted(out.glob(f"policies/*/{POLICY}.json")):
-        for package, version in read_json(file, "card of the policy").get("versions", {}).items():
-            found.setdefault(package, {})[str(version)] = None
+        for package, version in read_versions(file.with_suffix("")).items():
+            found.setdefault(package, {})[version] = None
     return [["package", "version"], *([name, ", ".join(all_)] for name, all_ in found.items())] if found else []
 
 

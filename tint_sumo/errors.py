@@ -15,6 +15,10 @@ class InputError(ValueError):
     """Bad input: one line that says what is wrong and how to mend it. The command line exits with code 2 on it."""
 
 
+class NotFiniteError(InputError):
+    """What a policy computes is not finite: its weights, or what it observes, are too large or NaN."""
+
+
 def find_named(kind: str, name: str, known: Mapping[str, T]) -> T:
     """The one of the known things that has this name.
 

@@ -35,6 +35,7 @@ from tint_sumo.progress import Progress, Report
 from tint_sumo.study.evaluation import CASE_SEED, evaluate
 from tint_sumo.study.loading import load_policy
 from tint_sumo.study.training import CURVE_FILE, ZIP_FILE, share_training, train_policy
+from tint_sumo.study.training_films import film_policy
 from tint_sumo.traits.storage import save
 
 SNAPSHOTS = ["policy-25.json", "policy-25.safetensors", "policy-50.json", "policy-50.safetensors"]
@@ -419,6 +420,25 @@ def test_a_training_that_diverges_says_where_and_keeps_its_last_finite_policy(
     train(tmp_path / "run")
     train(tmp_path / "at_a_stretch")
     assert_same_training(tmp_path / "run", tmp_path / "at_a_stretch")
+
+
+def test_a_film_of_a_policy_that_has_diverged_leaves_it_to_the_training_to_say_so(
+    tmp_path: Path, tiny: PpoSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All its weights are finite, and what follows from them is not."""
+
+    def overflow(policy: Path) -> bytes | None:
+        with monkeypatch.context() as patched:
+            patched.setattr("tint_sumo.study.training_films.load_policy", lambda *_, **__: broken(load_policy(policy)))
+            return film_policy(policy)
+
+    def broken(contender: Any) -> Any:
+        with torch.no_grad():
+            for parameter in contender.policy.parameters():
+                parameter.fill_(3e38)
+        return contender
+
+    train_policy("oracle", 0.4, 64, 0, tmp_path / "run", settings=tiny, film=overflow)
 
 
 # Folders and arguments

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import Tensor, nn
 
 from tint_sumo.config import PolicySettings
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, NotFiniteError
 from tint_sumo.policy.gru import ResetGru
 from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS
 
@@ -326,7 +326,7 @@ class GruPolicy(ActorCriticPolicy):
             The action or N actions, and the state for the next call.
 
         Raises:
-            InputError: the observation or the weights have numbers that are not finite.
+            NotFiniteError: the observation or the weights have numbers that are not finite, or too large.
         """
         self.set_training_mode(False)
         obs, vectorized = self.obs_to_tensor(observation)
@@ -336,7 +336,7 @@ class GruPolicy(ActorCriticPolicy):
         try:
             distribution, states = self.get_distribution(obs, states, torch.as_tensor(starts, device=self.device))
         except FloatingPointError as error:
-            raise InputError(f"{error}; give others") from None
+            raise NotFiniteError(f"{error}; give others") from None
         actions = distribution.get_actions(deterministic=deterministic).view(-1, *self._action_shape()).cpu().numpy()
         if isinstance(self.action_space, spaces.Box):
             actions = np.clip(actions, self.action_space.low, self.action_space.high)

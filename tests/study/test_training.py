@@ -422,7 +422,7 @@ def test_a_training_that_diverges_says_where_and_keeps_its_last_finite_policy(
     assert_same_training(tmp_path / "run", tmp_path / "at_a_stretch")
 
 
-def test_a_film_of_a_policy_that_has_diverged_leaves_it_to_the_training_to_say_so(
+def test_a_film_of_a_policy_that_has_diverged_says_at_which_step(
     tmp_path: Path, tiny: PpoSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All its weights are finite, and what follows from them is not."""
@@ -438,7 +438,8 @@ def test_a_film_of_a_policy_that_has_diverged_leaves_it_to_the_training_to_say_s
                 parameter.fill_(3e38)
         return contender
 
-    train_policy("oracle", 0.4, 64, 0, tmp_path / "run", settings=tiny, film=overflow)
+    with pytest.raises(DivergedError, match=r"^the training diverged at step \d+: .*film are not finite"):
+        train_policy("oracle", 0.4, 64, 0, tmp_path / "run", settings=tiny, film=overflow)
 
 
 # Folders and arguments

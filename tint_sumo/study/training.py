@@ -22,7 +22,7 @@ from tint_sumo.checkpoints import remove_checkpoint, write_checkpoint
 from tint_sumo.config import LATENT_SIZE, PpoSettings, Share, ends, require_share
 from tint_sumo.determinism import preserved_random_state, single_threaded
 from tint_sumo.envs.rows import OUTCOMES
-from tint_sumo.errors import DivergedError, InputError
+from tint_sumo.errors import DivergedError, InputError, NotFiniteError
 from tint_sumo.files import claim_folder, write_text
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
@@ -249,8 +249,18 @@ def _learn(
 
 
 def _log_film(model: BaseAlgorithm, stem: Path, film: FilmMaker | None) -> None:
-    """Log a film of the policy that has just been kept."""
-    gif = None if film is None else film(weights_file(stem))
+    """Log a film of the policy that has just been kept.
+
+    Raises:
+        DivergedError: the policy's outputs are not finite in the film.
+    """
+    try:
+        gif = None if film is None else film(weights_file(stem))
+    except NotFiniteError:
+        problem = (
+            f"the training diverged at step {model.num_timesteps}: the policy's outputs in its film are not finite"
+        )
+        raise DivergedError(f"{problem}; choose a lower learning_rate") from None
     if gif is not None:
         log_film(model.logger, "film", gif, model.num_timesteps)
 

@@ -11,6 +11,8 @@ import pytest
 
 from tests.study.scenes import trained
 from tint_sumo import traits
+from tint_sumo.dataset.recorder import record
+from tint_sumo.dataset.windows import read_manifest
 from tint_sumo.errors import InputError
 from tint_sumo.files import RUN_FILE, claim_folder, shipped, write_json
 from tint_sumo.policy.storage import read_versions
@@ -140,3 +142,16 @@ def test_cards_of_policies(tmp_path: Path) -> None:
     card["versions"] = {"torch": "2"}
     write_json(tmp_path / "policy.json", card)
     check(tmp_path / "policy.json", lambda: (read_versions(tmp_path / "policy"), load_policy(tmp_path)))
+
+
+def test_manifests_of_datasets(tmp_path: Path) -> None:
+    """Read by all that take a dataset, and by a recording that goes on."""
+    settings: Any = {"windows": 1, "population": "traits", "seed": 3, "workers": 1, "progress": False}
+    record(tmp_path / "data", **settings)
+    file = tmp_path / "data" / "manifest.json"
+    manifest = json.loads(file.read_text())
+    check(file, lambda: read_manifest(tmp_path / "data"))
+    for shards in ([], "x", -1, None, 1e300):
+        write_json(file, {**manifest, "shards": shards})
+        with pytest.raises(InputError, match=r"manifest\.json is damaged \(shards: must"):
+            record(tmp_path / "data", **settings)

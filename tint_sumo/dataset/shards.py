@@ -32,9 +32,10 @@ from tint_sumo.dataset.schema import (
     shard_number,
     shard_path,
 )
+from tint_sumo.dataset.windows import read_manifest
 from tint_sumo.errors import InputError
 from tint_sumo.executors import Executor, Work, Workers, executor_of
-from tint_sumo.files import claim_folder, read_json, whole_file, write_json
+from tint_sumo.files import claim_folder, whole_file, write_json
 from tint_sumo.progress import make_bar
 from tint_sumo.provenance import versions
 from tint_sumo.stores import Store, is_url, working_folder
@@ -116,9 +117,9 @@ def _finished(folder: Path, store: Store, shards: Work[ShardContents]) -> dict[s
     """The manifest of a complete dataset."""
     if not (folder / MANIFEST).exists():
         return None
-    manifest = read_json(folder / MANIFEST, "dataset manifest")
+    manifest = read_manifest(folder)
     held = store.files()
-    wanted = (path for shard in range(int(manifest.get("shards", 0))) for path in shards.paths(shard))
+    wanted = (path for shard in range(manifest["shards"]) for path in shards.paths(shard))
     return manifest if all(path in held for path in wanted) else None
 
 

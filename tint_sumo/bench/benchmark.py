@@ -22,10 +22,11 @@ import numpy as np
 import torch
 
 from tint_sumo import ENV_IDS
-from tint_sumo.bench.measuring import Clocks, Turn, one_thread, turns_apart
+from tint_sumo.bench.measuring import Clocks, Turn, turns_apart
 from tint_sumo.bench.policies import DECISION_METHOD, INSTALL_SB3_CONTRIB, decision_ms, training_speed
 from tint_sumo.config import WINDOW_STEPS, PpoSettings
 from tint_sumo.dataset.windows import Windows
+from tint_sumo.determinism import single_threaded
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.progress import make_bar
@@ -356,7 +357,7 @@ def _memory(sizes: Sizes) -> dict[str, Any]:
 
 def _traits(sizes: Sizes) -> dict[str, Any]:
     """Each trait method with the sizes of the full budget and one thread of torch, as in the study's jobs."""
-    with one_thread():
+    with single_threaded():
         training = {method: _train_windows_per_s(method, sizes.training_windows) for method in TRAIT_METHODS}
         encoding = {method: _encode_ms(method, sizes.turns) for method in TRAIT_METHODS}
     return {"train_windows_per_s": training, "encode_ms": encoding}

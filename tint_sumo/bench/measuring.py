@@ -6,8 +6,6 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
-import torch
-
 from tint_sumo.processes import answer, start_worker, told
 from tint_sumo.timing import marked_methods
 
@@ -50,17 +48,6 @@ def _call_s(function: Callable[[], Any], calls: int = 100) -> float:
     for _ in range(calls):
         function()
     return (time.perf_counter() - start) / calls
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """One thread of torch, as in the study's jobs."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @contextmanager

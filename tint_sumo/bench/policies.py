@@ -13,8 +13,9 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits
-from tint_sumo.bench.measuring import Clocks, Turn, one_thread, turns_apart
+from tint_sumo.bench.measuring import Clocks, Turn, turns_apart
 from tint_sumo.config import PpoSettings
+from tint_sumo.determinism import single_threaded
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy import ActionRepeat, GruPolicy, StreamingTraits, TraitObservation
 from tint_sumo.study.budgets import ALL_MIXES
@@ -53,7 +54,7 @@ def training_speed(settings: PpoSettings, turns: int) -> dict[str, float | None]
 def _training(make: MakeModel, settings: PpoSettings) -> Iterator[Turn]:
     """Decisions per second of one more rollout, updates included, in a training as the study has it."""
     venv = training_venv(find_learned("no_labels"), None, ALL_MIXES, settings)
-    with closing(venv), one_thread():
+    with closing(venv), single_threaded():
         model = make(venv, 0, settings)
         model.set_logger(Logger(None, []))
         decisions = settings.n_envs * settings.n_steps
@@ -86,7 +87,7 @@ def decision_ms(settings: PpoSettings, decisions: int) -> float:
     """Median time of a decision (``DECISION_METHOD``) with streaming traits and a network as large as the study's."""
     env = SceneVecEnv(1, seed=0, tracks=True)
     observed = TraitObservation(env, StreamingTraits(traits.load("cross_window")))
-    with closing(ActionRepeat(observed, settings.action_repeat)) as venv, one_thread():
+    with closing(ActionRepeat(observed, settings.action_repeat)) as venv, single_threaded():
         policy = GruPolicy(venv.observation_space, venv.action_space, lambda _: 0.0, settings=settings.policy)
         clocks = Clocks()
         clocks.watch(env)

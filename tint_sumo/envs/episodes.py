@@ -11,7 +11,17 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from tint_sumo.config import POSITION_SCALE_M, REWARD_PRESETS, SPEED_SCALE_MPS, Backend, Share
+from tint_sumo.config import (
+    POSITION_SCALE_M,
+    REWARD_PRESETS,
+    SPEED_SCALE_MPS,
+    Backend,
+    Decisions,
+    NoiseM,
+    Share,
+    TauS,
+    TimeS,
+)
 from tint_sumo.envs.rows import (
     BOUND,
     COLLISION,
@@ -27,7 +37,8 @@ from tint_sumo.envs.rows import (
     observe_tracks,
     row_type,
 )
-from tint_sumo.errors import InputError
+from tint_sumo.errors import InputError, shown
+from tint_sumo.ranges import require_ranges
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, find_scene
 from tint_sumo.scenes.geometry import Floats
 from tint_sumo.simulation.own import make_simulation
@@ -49,24 +60,23 @@ class TaskSettings:
     scene: str | Scene | OwnScene = T_INTERSECTION
     p_conservative: Share | None = None
     reward: str = "paper"
-    time_limit_s: float | None = None
-    position_noise_m: float = 0.0
-    tau_s: float | None = None
+    time_limit_s: TimeS | None = None
+    position_noise_m: NoiseM = 0.0
+    tau_s: TauS | None = None
     tracks: bool = False
-    decision_s: float | None = None
-    max_episode_steps: int | None = None
+    decision_s: TimeS | None = None
+    max_episode_steps: Decisions | None = None
     backend: Backend = "auto"
 
     def __post_init__(self) -> None:
         if self.reward not in REWARD_PRESETS:
             raise InputError(f"unknown reward preset {self.reward!r}; choose one of {', '.join(REWARD_PRESETS)}")
-        if not 0.0 <= self.position_noise_m < math.inf:
-            raise InputError(f"position_noise_m must be finite and not negative, not {self.position_noise_m}")
+        require_ranges(self)
+        if not isinstance(self.tracks, bool):
+            raise InputError(f"tracks must be True or False, not {shown(self.tracks)}")
         steps = self._decision_s / self._step_s
-        if not (math.isfinite(steps) and math.isclose(steps, max(round(steps), 1), rel_tol=_STEP_TOLERANCE)):
+        if not math.isclose(steps, max(round(steps), 1), rel_tol=_STEP_TOLERANCE):
             raise InputError(f"decision_s must be a multiple of the step of {self._step_s:g} s, not {self.decision_s}")
-        if self.max_episode_steps is not None and self.max_episode_steps < 1:
-            raise InputError(f"max_episode_steps must be at least 1, not {self.max_episode_steps}")
         scene = self.played
         if not scene.step_s <= scene.time_limit_s < math.inf:
             raise InputError(

@@ -109,7 +109,7 @@ def slurm(tmp_path: Path) -> Iterator[Slurm]:
     shutil.rmtree(f"/tmp/ray-{machine.job}", ignore_errors=True)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_slurm_runs_a_command_on_all_nodes_and_ends_ray(slurm: Slurm, tmp_path: Path) -> None:
     (tmp_path / "command.py").write_text(ON_TWO_NODES)
     process = slurm.start(2, sys.executable, str(tmp_path / "command.py"), str(tmp_path / "found.json"))

@@ -22,19 +22,20 @@ ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 RESULTS = ROOT / "data" / "results"
 DOCS = ROOT / "docs"
-TYPED = [
-    README,
-    DOCS / "getting-started.md",
-    DOCS / "reference" / "environments.md",
-    *sorted(DOCS.glob("tutorials/*.md")),
-    *sorted(DOCS.glob("how-to/*.md")),
-]
+FIRST_READ = [README, DOCS / "getting-started.md", DOCS / "reference" / "environments.md"]
+READ_LATER = [*sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("how-to/*.md"))]
+TYPED = [*FIRST_READ, *READ_LATER]
 _FETCHED = re.compile(r"<(?:script|img|link rel=.stylesheet.)[^>]+(?:src|href)=.(https?://[^\"']+)")
 _TABLE = re.compile(r"(?:^\|.*\|\n)+", re.MULTILINE)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", TYPED, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page",
+    [
+        *(pytest.param(page, id=page.stem, marks=pytest.mark.slow) for page in FIRST_READ),
+        *(pytest.param(page, id=page.stem, marks=pytest.mark.long) for page in READ_LATER),
+    ],
+)
 def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.documents", str(page)]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}

@@ -61,9 +61,18 @@ def test_same_seed_same_weights() -> None:
     assert not torch.equal(weights(first), weights(other))
 
 
+def test_every_rollout_is_logged() -> None:
+    model = make(Memory(4), n_steps=8, n_epochs=1)
+    logged: list[int] = []
+    model.dump_logs = lambda iteration=0: logged.append(iteration)  # type: ignore[method-assign]
+    model.learn(4 * 8 * 4)
+    assert logged == [1, 2, 3, 4]
+
+
 def test_the_entropys_weight_may_change_linearly() -> None:
     env = Memory(4)
     model = make(env, n_steps=8, n_epochs=1, ent_coef=LinearSchedule(0.1, 0.0, 1.0))
+    assert model.ent_coef == 0.1
     weights_seen: list[float] = []
     update = model.train
     model.train = lambda: (update(), weights_seen.append(model.ent_coef))  # type: ignore[method-assign, assignment, func-returns-value]

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 import libsumo
 import pytest
+from traci.storage import Storage
 
 from tests.scenes.own_networks import OwnNetwork
 from tests.simulation.scenes import T
@@ -32,6 +33,15 @@ def test_a_second_simulation_in_the_process_takes_traci_and_libsumo_comes_back()
 def test_traci_when_asked_for() -> None:
     simulation = Simulation(1, T, backend="traci")
     assert simulation.backend == "traci"
+    simulation.close()
+
+
+def test_half_an_answer_that_an_interrupt_has_left_does_not_keep_traci_from_closing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    simulation = Simulation(1, T, backend="traci")
+    traci_connection = simulation.link.connection.vehicle._connection
+    monkeypatch.setattr(traci_connection, "_recvExact", lambda: Storage(b""))
     simulation.close()
 
 

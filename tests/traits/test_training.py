@@ -31,13 +31,13 @@ def assert_same_weights(one, other):
 
 
 def test_a_run_writes_a_model_that_loads_as_trained(windows, small, tmp_path):
-    model = train(windows, small, tmp_path / "run", card={"data": "street"})
+    model = train(windows, small, tmp_path / "run", card={"data": {"scene": "street"}})
     assert_same_weights(load(tmp_path / "run"), model)
     assert not model.training
     card = json.loads((tmp_path / "run" / "model.json").read_text())
     assert card["method"] == "vae"
     assert card["latent_size"] == 2
-    assert card["data"] == "street"
+    assert card["data"] == {"scene": "street"}
     assert card["windows"] == len(windows.length)
     assert {path.name for path in (tmp_path / "run").glob("[!.]*")} == {
         *("run.json", "model.json", "model.safetensors", "tensorboard"),

@@ -29,7 +29,7 @@ test: lint
 	$(BIN)/pytest -n 2 --dist worksteal
 
 test-long: install
-	$(BIN)/pytest -n 2 --dist worksteal -m long
+	$(BIN)/pytest -m long
 
 lint: install
 	$(BIN)/ruff check .

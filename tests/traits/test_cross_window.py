@@ -144,6 +144,7 @@ def test_predictions_follow_the_other_window_and_know_the_latent(model):
     assert torch.allclose(log_std, expected[..., 1], atol=1e-6)
     assert torch.equal(target, features[:, 1:, 0].T)
     assert valid.T.tolist() == [[True] * 5, [True] * 3 + [False] * 2, [True] + [False] * 4]
+    assert not model.from_latent(torch.zeros(1, 2)).any()  # a latent of zero, the prior's mean, changes nothing
 
 
 @pytest.mark.parametrize(("bias", "log_std"), [(-100.0, -4.0), (100.0, 3.0)])

@@ -7,7 +7,8 @@
 
 Cosmic Ray makes the mutants and keeps their results in runs/mutants, so that an interrupted call goes on. --seconds
 ends a call after some time. A module that has changed begins anew. --again tries the survivors once more, after tests
-have been written. Mutants that do the same as the code are in tests/mutants.toml, with the reason, and do not count.
+have been written; until then they stay survivors. Mutants that do the same as the code are in tests/mutants.toml, with
+the reason, and do not count.
 
 Works in a copy of the repository, which changes of yours do not reach until the next call. Where a module has compiled
 functions, all of them run as Python, so that no mutant has to be compiled. Tests run in processes that are forked off
@@ -130,9 +131,8 @@ def _break_module(name: str, tree: Path, arguments: argparse.Namespace, end_s: f
         count = min(len(mutants), arguments.sample or len(mutants))
         chosen = random.Random(SEED).sample(mutants, count)
         results = dict(db.results)
-        if arguments.again:
-            results = {job: one for job, one in results.items() if one.test_outcome == TestOutcome.KILLED}
-        waiting = [one for one in chosen if one.job_id not in results]
+        settled = {job for job, one in results.items() if not arguments.again or one.test_outcome == TestOutcome.KILLED}
+        waiting = [one for one in chosen if one.job_id not in settled]
         if waiting and time.monotonic() < end_s:
             numba.config.DISABLE_JIT = "@compiled" in source  # type: ignore[attr-defined]
             limit_s = SLOWEST_S + 3.0 * _prepare(tests)

@@ -139,7 +139,7 @@ def _break_module(name: str, tree: Path, arguments: argparse.Namespace, end_s: f
             for number, item in enumerate(waiting):
                 if time.monotonic() > end_s:
                     break
-                results[item.job_id] = _try(db, item, tests, limit_s)
+                results[item.job_id] = _try(db, item, file, tests, limit_s)
                 print(f"\r{name}: {number + 1} of {len(waiting)} mutants", end="", file=sys.stderr, flush=True)
             print(file=sys.stderr)
     return _tally(name, len(mutants), [results[one.job_id] for one in chosen if one.job_id in results])
@@ -186,10 +186,11 @@ def _annotations(module: ast.Module) -> Iterator[ast.expr]:
             yield node.returns
 
 
-def _try(db: WorkDB, item: WorkItem, tests: Sequence[str], limit_s: float) -> WorkResult:
+def _try(db: WorkDB, item: WorkItem, file: Path, tests: Sequence[str], limit_s: float) -> WorkResult:
     (mutation,) = item.mutations
     operator = get_operator(mutation.operator_name)(**mutation.operator_args)
-    with use_mutation(Path(mutation.module_path), operator, mutation.occurrence) as (was, now):
+    # The item also has a path, which is that of another copy if the folder of the results has been moved.
+    with use_mutation(file, operator, mutation.occurrence) as (was, now):
         assert now is not None
         outcome = _run_tests(tests, limit_s)
     result = WorkResult(WorkerOutcome.NORMAL, test_outcome=outcome, diff=_changed(was, now))

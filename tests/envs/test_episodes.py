@@ -152,7 +152,10 @@ def test_noise_is_drawn_anew_in_every_step_and_episode() -> None:
             for batch in (noisy, clear):
                 batch.begin(0, np.random.default_rng(seed))
             for _ in range(3):
-                drawn.append((noisy.rows["vehicles"] - clear.rows["vehicles"])[0, 0].tolist())
+                noise = (noisy.rows["vehicles"] - clear.rows["vehicles"])[0]
+                drawn.append(noise[0].tolist())
+                shown = np.round(noise[clear.rows["mask"][0] == 1.0], 6)
+                assert len(np.unique(shown, axis=0)) == len(shown) > 1, "each vehicle has noise of its own"
                 for batch in (noisy, clear):
                     batch.step(np.array([STOP]))
         assert clear._noise == {} and not clear._noise_m.any()

@@ -69,6 +69,11 @@ def test_every_rollout_is_logged() -> None:
     assert logged == [1, 2, 3, 4]
 
 
+def test_a_training_prints_nothing_by_default(capfd: pytest.CaptureFixture[str]) -> None:
+    make(Memory(4)).learn(32)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_the_entropys_weight_may_change_linearly() -> None:
     env = Memory(4)
     model = make(env, n_steps=8, n_epochs=1, ent_coef=LinearSchedule(0.1, 0.0, 1.0))

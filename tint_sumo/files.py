@@ -9,7 +9,6 @@ from tempfile import TemporaryFile
 from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
-from pydantic_core import from_json
 
 from tint_sumo.errors import InputError
 from tint_sumo.provenance import CONFIG_FILE, PROVENANCE_FILE, made_by, present_origin
@@ -78,6 +77,8 @@ def read_json(path: Path, what: str, most_bytes: int = JSON_BYTES) -> dict[str, 
     Raises:
         InputError: the file is missing, too large or damaged; ``what`` names its role in the message.
     """
+    from pydantic_core import from_json  # noqa: PLC0415 - where files are read, and nowhere else
+
     text = read_file(path, what, most_bytes)
     try:
         value = from_json(text)

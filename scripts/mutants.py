@@ -68,7 +68,7 @@ TESTS = {  # by the module that is broken
 
 @dataclass(frozen=True)
 class Tally:
-    """What became of the mutants of a module."""
+    """Counts of the mutants of a module by their outcome."""
 
     module: str
     mutants: int  # all that there are

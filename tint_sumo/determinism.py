@@ -1,4 +1,4 @@
-"""What results could depend on beside their seeds: the global random state of the process, and torch's threads."""
+"""Control of two things that results must not depend on: global random state, and the number of torch's threads."""
 
 import random
 from collections.abc import Iterator

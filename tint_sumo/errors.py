@@ -16,7 +16,7 @@ class InputError(ValueError):
 
 
 class NotFiniteError(InputError):
-    """What a policy computes is not finite: its weights, or what it observes, are too large or NaN."""
+    """Outputs of a policy are not finite, because its weights or observations are too large or NaN."""
 
 
 def find_named(kind: str, name: str, known: Mapping[str, T]) -> T:

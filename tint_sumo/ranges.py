@@ -1,4 +1,4 @@
-"""Which numbers a setting allows, said once beside its type: for files, flags and Python alike."""
+"""Ranges of numbers, given once beside the type of a setting: for files, flags and Python alike."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -11,7 +11,7 @@ from tint_sumo.errors import InputError, shown
 
 @dataclass(frozen=True)
 class Range:
-    """Of a number: it lies in this range, ends included. Beside a type, as ``Annotated[int, Range(1, 64)]``."""
+    """The range in which a number must lie, ends included. Beside a type, as ``Annotated[int, Range(1, 64)]``."""
 
     low: float
     high: float
@@ -44,7 +44,7 @@ class Range:
 
 @dataclass(frozen=True)
 class Length(Range):
-    """Of a tuple: it has so many items."""
+    """The range in which the number of items of a tuple must lie."""
 
     def __str__(self) -> str:
         return f"({_digits(self.low)} to {_digits(self.high)} of them)"

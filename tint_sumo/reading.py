@@ -1,4 +1,4 @@
-"""Files that others may have written: they are opened only if they are regular ones, and no larger than their kind is.
+"""Reading of files that others may have written: only regular files up to a size that suits their kind are opened.
 
 Pipes and devices would keep a command waiting, or never end.
 """

@@ -1,4 +1,4 @@
-"""What a command prints: any name can be shown, and errors in writing it show before the interpreter ends."""
+"""Output of commands: any name can be printed, and write errors show before the interpreter ends."""
 
 import io
 import os

@@ -41,7 +41,7 @@ def read_weights(
         card: what the card says; weights without a checksum there are read, and a line on stderr says so.
 
     Raises:
-        InputError: the file is missing, damaged, not the one that the card tells of, or holds a number that is not
+        InputError: the file is missing, damaged, not the one that the card describes, or holds a number that is not
             finite; or ``build`` raises it.
     """
     require_file(file, "weights", WEIGHTS_BYTES)

@@ -1,4 +1,4 @@
-"""What environments refuse, in one line and before they do anything: bad actions, seeds, masks, and wrong moments."""
+"""Refused calls of environments, in one line and before anything is done: actions, seeds, masks, wrong phases."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing

@@ -1,4 +1,4 @@
-"""What gymnasium and Stable-Baselines3 expect of an environment."""
+"""Conventions of gymnasium and Stable-Baselines3 for environments."""
 
 import warnings
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What settings mean, and how episodes follow from seeds."""
+"""Meaning of settings, and how episodes follow from seeds."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

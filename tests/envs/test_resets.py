@@ -1,4 +1,4 @@
-"""What an environment is like after a reset: like a new one, whatever came before."""
+"""An environment after a reset is like a new one, whatever came before."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing

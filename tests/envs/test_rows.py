@@ -1,4 +1,4 @@
-"""What is written of a step made by hand."""
+"""Rows written after a step that is made by hand."""
 
 import math
 from dataclasses import replace

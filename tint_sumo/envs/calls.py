@@ -1,4 +1,4 @@
-"""What callers may ask of an environment, and when: checked before anything is done."""
+"""Checks of the calls of an environment: its phase, actions, seeds and masks, before anything is done."""
 
 import operator
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ _SHOWN = 80  # characters of a value that is refused
 
 
 class Phase(Enum):
-    """Where an environment is between its making and its end; the value says why it cannot step."""
+    """The phase of an environment between creation and closing; the value says why it cannot step."""
 
     NEW = "no episode has begun; reset the environment first"
     READY = ""

@@ -185,7 +185,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     def _play(self, actions: Sequence[int]) -> None:
         """Begin an episode drawn from the generator, and take these actions in it."""
-        if self._phase is Phase.BUSY:  # nobody knows how much of an interrupted call was done
+        if self._phase is Phase.BUSY:  # an interrupted call may have been done in part
             self._stop()
         self._phase = Phase.BUSY
         self._began = dict(self.np_random.bit_generator.state)
@@ -269,7 +269,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         return {name: value for name, value in vars(self).items() if name not in ("_window", "_episodes")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Become the copy that ``state`` tells of, in a simulation of its own.
+        """Restore a copy from its state, in a simulation that it alone uses.
 
         Libsumo may be in use by the original; then the copy goes through TraCI.
         """

@@ -141,7 +141,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         mask = checked_mask(checked_options(options, ("reset_mask",)).get("reset_mask"), self.num_envs)
         if not mask.all():
             require_episode(self._phase)
-        if self._phase is Phase.BUSY:  # nobody knows how much of an interrupted call was done
+        if self._phase is Phase.BUSY:  # an interrupted call may have been done in part
             self._stop()
         self._phase = Phase.BUSY
         self.batch.reset(seeds, mask)
@@ -236,7 +236,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return _masked(infos, mask.copy())
 
     def _ending(self, ended: Ended) -> dict[str, Any]:
-        """What the infos hold of an episode's end beside those of where its environment is now."""
+        """Return the entries that infos get where an episode has ended."""
         if self._mode is not AutoresetMode.SAME_STEP:
             return end_info(ended.outcome, ended.collision)
         last = fields_of(ended.row)
@@ -262,7 +262,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return attributes, self.snapshot() if self._phase is Phase.READY else []
 
     def __setstate__(self, state: tuple[dict[str, Any], list[Snapshot]]) -> None:
-        """Become the copy that ``state`` tells of, as in ``SceneEnv``."""
+        """Restore a copy from its state, as in ``SceneEnv``."""
         attributes, snapshots = state
         vars(self).update(attributes)
         self._settings = [replace(one, backend="auto") if one.backend == "libsumo" else one for one in self._settings]

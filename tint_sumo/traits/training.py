@@ -111,7 +111,7 @@ def train(
 
 @dataclass(frozen=True)
 class _State:
-    """What a training goes on from beside its tensors."""
+    """State of a training beside its tensors, from which it is resumed."""
 
     epochs: Annotated[int, Range(0, 2**62)]  # that are finished
     loss: dict[str, float]  # terms of the last one

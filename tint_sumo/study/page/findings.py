@@ -38,15 +38,15 @@ def what_came_out(rows: Sequence[Summary]) -> str:
     best, worst = max(rates, key=rates.__getitem__), min(rates, key=rates.__getitem__)
     if rates[best] == rates[worst]:
         return f"{at} all {len(rates)} methods succeeded in {percent(rates[best])} % of the cases."
-    told = f"{at} the method {best} succeeded most often, in {percent(rates[best])} % of the cases, and {worst} least "
-    told += f"often, in {percent(rates[worst])} %."
+    text = f"{at} the method {best} succeeded most often, in {percent(rates[best])} % of the cases, and {worst} least "
+    text += f"often, in {percent(rates[worst])} %."
     inferring = [title for title, own in shown.items() if _infers(own[0].method)]
     without = [title for title, own in shown.items() if own[0].method == "no_labels"]
     if inferring and without:
         helped, bare = max(inferring, key=rates.__getitem__), max(without, key=rates.__getitem__)
-        told += f" The best method that infers traits, {helped}, reached {percent(rates[helped])} %; {bare}, which "
-        told += f"infers none, reached {percent(rates[bare])} %."
-    return told
+        text += f" The best method that infers traits, {helped}, reached {percent(rates[helped])} %; {bare}, which "
+        text += f"infers none, reached {percent(rates[bare])} %."
+    return text
 
 
 def _infers(name: str) -> bool:

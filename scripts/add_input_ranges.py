@@ -9,9 +9,9 @@ import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from tint_sumo.core.files import shipped
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import load_windows
-from tint_sumo.files import shipped
 from tint_sumo.traits.input_range import InputRange
 from tint_sumo.traits.storage import add_to_card
 

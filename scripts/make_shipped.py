@@ -20,23 +20,23 @@ from PIL import Image, ImageDraw, ImageFont
 
 from tint_sumo import ENV_IDS
 from tint_sumo.cli import main as tint_sumo
+from tint_sumo.comparisons.traits import TraitStudy
+from tint_sumo.core.files import write_json
 from tint_sumo.envs import SceneEnv
-from tint_sumo.files import write_json
+from tint_sumo.methods.registry import Learned, find_method
+from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.scenes.geometry import pose_distance_m
-from tint_sumo.simulation.own import OwnSimulation
 from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation.sumocfg import OwnSimulation
 from tint_sumo.study.budgets import BUDGETS
 from tint_sumo.study.figures import plot_bars, plot_worlds
-from tint_sumo.study.methods import Learned, find_method
-from tint_sumo.study.policy_jobs import label
+from tint_sumo.study.jobs import label
 from tint_sumo.study.results import read_results
 from tint_sumo.study.results_csv import read_csv
-from tint_sumo.study.rows import at_mixes, over_all_mixes, tabulate
-from tint_sumo.study.training import POLICY
-from tint_sumo.study.trait_models import evaluate_traits
-from tint_sumo.study.trait_study import TraitStudy
+from tint_sumo.study.summary import at_mixes, over_all_mixes, tabulate
+from tint_sumo.traits.datasets import evaluate_traits
 from tint_sumo.traits.storage import add_to_card
 
 TITLE_PX = 26

@@ -11,9 +11,9 @@ from statistics import median
 from ray.cluster_utils import Cluster
 
 from tint_sumo.dataset.recorder import record
-from tint_sumo.executors.cluster import RayCluster, ray_cluster
-from tint_sumo.study.evaluation_jobs import evaluate_on
-from tint_sumo.study.loading import load_policy
+from tint_sumo.jobs.cluster import RayCluster, ray_cluster
+from tint_sumo.methods.evaluation_jobs import evaluate_on
+from tint_sumo.methods.loading import load_policy
 
 CPU_GROUPS = Path("/sys/fs/cgroup/cpu")
 PERIOD_US = 100_000

@@ -61,8 +61,8 @@ TESTS = {  # by the module that is broken
     "policy/loss": "tests/policy/test_loss.py",
     "policy/ppo": "tests/policy/test_ppo.py",
     "policy/buffer": "tests/policy/test_buffer.py",
-    "study/evaluation": "tests/study/test_evaluation.py",
-    "study/statistics": "tests/study/test_statistics.py",
+    "methods/evaluation": "tests/methods/test_evaluation.py",
+    "core/statistics": "tests/core/test_statistics.py",
 }
 
 

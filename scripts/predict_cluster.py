@@ -12,13 +12,14 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 
-from tint_sumo.executors import Job, Local
-from tint_sumo.executors.jobs import Begun, Ended, News, run_jobs
-from tint_sumo.study.budgets import ALL_MIXES, BUDGETS, Budget, Conditions, Trials
+from tint_sumo.config import ALL_MIXES
+from tint_sumo.jobs import Job, Local
+from tint_sumo.jobs.jobs import Begun, Ended, News, run_jobs
+from tint_sumo.methods.registry import METHODS, Learned
+from tint_sumo.study.budgets import BUDGETS, Budget, Conditions, Trials
 from tint_sumo.study.ceiling_job import CeilingJob
-from tint_sumo.study.grid import plan
-from tint_sumo.study.methods import METHODS, Learned
-from tint_sumo.study.policy_jobs import EvaluateJob, TrainJob
+from tint_sumo.study.jobs import EvaluateJob, TrainJob
+from tint_sumo.study.plan import plan
 
 CORES = 2
 FULL = BUDGETS["full"]

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 
-from tint_sumo.cli import TintSumo
-from tint_sumo.configuration import subcommands
+from tint_sumo.cli.command_line import TintSumo
+from tint_sumo.cli.configuration import subcommands
 
 
 def commands(kind: type = TintSumo, name: str = "") -> Iterator[tuple[str, type]]:

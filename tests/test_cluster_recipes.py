@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tint_sumo.cli import SpreadCommand, parse
+from tint_sumo.cli.command_line import SpreadCommand, parse
 
 ROOT = Path(__file__).parents[1]
 CLUSTER = ROOT / "examples" / "cluster"

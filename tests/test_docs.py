@@ -13,10 +13,10 @@ import pytest
 from tests.commands import commands
 from tests.documents import blocks
 from tests.study.browser import FLAGS, require_browser
+from tint_sumo.core.percentages import percent
 from tint_sumo.envs.rows import OUTCOMES
-from tint_sumo.percentages import percent
 from tint_sumo.study.results_csv import read_csv
-from tint_sumo.study.rows import at_mixes, by_title, over_all_mixes
+from tint_sumo.study.summary import at_mixes, by_title, over_all_mixes
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"

@@ -13,10 +13,10 @@ from sumolib.geomhelper import positionAtShapeOffset
 
 from tests.dataset.test_recorder import WINDOWS, contents
 from tests.simulation.scenes import T
+from tint_sumo.core.files import shipped
 from tint_sumo.dataset.fcd import EPISODE_PERIOD_S, VEHICLE_TYPE, write_fcd
 from tint_sumo.dataset.recorder import record, simulate_episodes
 from tint_sumo.dataset.schema import FCD, TRAJECTORIES
-from tint_sumo.files import shipped
 from tint_sumo.scenes.layout import layout
 from tint_sumo.simulation.simulation import Simulation
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
+from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.inspection import QUANTILES, Distribution, Inspection, TraitStatistics, inspect, plot, report
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES
-from tint_sumo.errors import InputError
 
 CENTS = st.lists(st.integers(0, 400), min_size=1, max_size=50).map(lambda cents: np.array(cents) / 100)
 

@@ -10,9 +10,9 @@ import pytest
 
 from tests.simulation.scenes import T
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
+from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.recorder import EPISODE_STEPS, EPISODES_PER_SHARD, record, simulate_episodes
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES
-from tint_sumo.errors import InputError
 from tint_sumo.simulation.simulation import Simulation
 
 WINDOWS = 3000  # one shard

@@ -10,11 +10,11 @@ import pandas as pd
 import pytest
 import sumo
 
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import shipped
 from tint_sumo.dataset.fcd_reading import read_fcd
 from tint_sumo.dataset.schema import TRAJECTORIES
 from tint_sumo.dataset.tracks import read_tracks
-from tint_sumo.errors import InputError
-from tint_sumo.files import shipped
 
 NET = shipped("sumo_net") / "tint.net.xml"
 Seen = tuple[str, str, float, float]  # vehicle, lane, pos, speed

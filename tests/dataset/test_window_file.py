@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tint_sumo.core.errors import InputError
 from tint_sumo.dataset import window_file as module
 from tint_sumo.dataset.window_file import WindowFile, window_file
 from tint_sumo.dataset.windows import Windows, load_labels, load_windows, read_windows
-from tint_sumo.errors import InputError
 
 
 @pytest.fixture

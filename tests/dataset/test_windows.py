@@ -12,6 +12,7 @@ import pytest
 
 from tests.simulation.scenes import T
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, NO_LEADER_GAP_M
+from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.recorder import EPISODES_PER_SHARD, record, simulate_episodes
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, TRAJECTORY_SCHEMA, read_shard, verify
 from tint_sumo.dataset.windows import (
@@ -24,7 +25,6 @@ from tint_sumo.dataset.windows import (
     read_training_windows,
     split_by_episode,
 )
-from tint_sumo.errors import InputError
 from tint_sumo.simulation.demand import PlacedVehicle
 from tint_sumo.simulation.simulation import Simulation
 

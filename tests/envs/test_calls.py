@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from tests.envs.test_environments import ENV_ID, assert_equal
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv
 from tint_sumo.envs.sb3 import SceneVecEnv
-from tint_sumo.errors import InputError
 
 INTEGERS: tuple[Any, ...] = (
     *(np.dtype(kind).type for kind in np.typecodes["AllInteger"]),

@@ -18,9 +18,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor
 
 from tint_sumo import ENV_IDS, SCENE_ENV_ID
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv
 from tint_sumo.envs.sb3 import SceneVecEnv
-from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION
 
 ENV_ID = ENV_IDS[T_INTERSECTION]

@@ -15,11 +15,11 @@ import pytest
 
 from tests.envs.test_resets import assert_same_answers
 from tests.envs.test_workers import assert_infos_equal
-from tests.scenes.own_networks import OwnNetwork
+from tests.scenes.networks import OwnNetwork
 from tint_sumo import ENV_IDS, SCENE_ENV_ID
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv
 from tint_sumo.envs.sb3 import SceneVecEnv
-from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION
 
 TASK: dict[str, Any] = {"position_noise_m": 0.1, "tracks": True, "time_limit_s": 6.0, "p_conservative": (0.2, 0.8)}

@@ -13,11 +13,11 @@ from stable_baselines3.common.vec_env import VecMonitor
 from tests.simulation.scenes import LOWER
 from tint_sumo import ENV_IDS
 from tint_sumo.config import REWARD_PRESETS
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs.rows import TRACKS
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.envs.scene_env import SceneEnv
 from tint_sumo.envs.vector import SceneVectorEnv
-from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION
 
 ENV_ID = ENV_IDS[T_INTERSECTION]

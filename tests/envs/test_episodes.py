@@ -10,6 +10,7 @@ import pytest
 from gymnasium import spaces
 
 from tint_sumo.config import Population, Traffic
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs.episodes import (
     Episodes,
     TaskSettings,
@@ -19,7 +20,6 @@ from tint_sumo.envs.episodes import (
     require_arguments,
 )
 from tint_sumo.envs.rows import NOBODY
-from tint_sumo.errors import InputError
 from tint_sumo.scenes import find_scene
 
 T = find_scene("t_intersection")

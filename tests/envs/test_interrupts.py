@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.envs.test_resets import assert_same_answers
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv
-from tint_sumo.errors import InputError
 
 TASK: dict[str, Any] = {"position_noise_m": 0.1, "tracks": True, "time_limit_s": 0.8}
 Make = Callable[[], Any]

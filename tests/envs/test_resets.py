@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.envs.test_workers import assert_infos_equal
-from tests.scenes.own_networks import OWN_NETWORKS, OwnNetwork
+from tests.scenes.networks import OWN_NETWORKS, OwnNetwork
 from tint_sumo.envs import SceneEnv, SceneVectorEnv
 from tint_sumo.envs.episodes import Episodes
 from tint_sumo.scenes import SCENES

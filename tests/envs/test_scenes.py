@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from tint_sumo import ENV_IDS, SCENE_ENV_ID
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv
-from tint_sumo.errors import InputError
 from tint_sumo.scenes import SCENES, find_scene
 
 GO = np.int64(2)

@@ -12,10 +12,10 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from tests.envs.test_workers import assert_infos_equal
 from tint_sumo import ENV_IDS
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.rows import OUTCOMES
-from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.simulation.ego import Collision
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from PIL import ImageGrab
 
 from tint_sumo import ENV_IDS
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs.rendering import render_scene
 from tint_sumo.envs.scene_env import SceneEnv
-from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION
 
 ENV_ID = ENV_IDS[T_INTERSECTION]
@@ -98,7 +98,7 @@ def test_gymnasiums_checker_with_every_render_mode(display: str) -> None:
 def test_without_a_display_one_line_says_what_to_do() -> None:
     code = f"""
 import gymnasium, tint_sumo
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 try:
     gymnasium.make("{ENV_ID}", render_mode="human")
 except InputError as error:

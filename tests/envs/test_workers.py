@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from tests.envs.test_environments import ENV_ID, assert_equal
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.envs.vector import SceneVectorEnv
-from tint_sumo.errors import InputError
 
 PATIENCE_S = 30.0
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs.sb3 import SceneVecEnv
-from tint_sumo.errors import InputError
 from tint_sumo.policy import ActionRepeat
 
 GO, STOP = 2, 0

@@ -10,7 +10,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from torch import Tensor
 
 from tint_sumo.config import PolicySettings
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.policy.network import AttentionExtractor, GruPolicy
 from tint_sumo.policy.trait_observation import TRUE_TRAITS
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecMonitor
 
-from tint_sumo.errors import DivergedError, InputError
+from tint_sumo.core.errors import DivergedError, InputError
 from tint_sumo.policy.buffer import SequenceBuffer
 from tint_sumo.policy.ppo import RecurrentPPO
 

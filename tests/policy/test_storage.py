@@ -15,13 +15,13 @@ from safetensors.torch import load_file
 from tests.bombs import BOMBS, bomb
 from tests.simulation.scenes import T
 from tint_sumo.config import PolicySettings
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import shipped
+from tint_sumo.core.weights import SHA256, write_weights
 from tint_sumo.envs.episodes import action_space, observation_space
-from tint_sumo.errors import InputError
-from tint_sumo.files import shipped
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
 from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS, trait_space
-from tint_sumo.weights import SHA256, write_weights
 
 from .tasks import SMALL
 

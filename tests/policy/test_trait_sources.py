@@ -7,7 +7,7 @@ import torch
 from gymnasium import spaces
 
 from tint_sumo.config import NO_LEADER_GAP_M
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.policy.trait_observation import TRUE_TRAITS, TraitObservation
 from tint_sumo.policy.trait_sources import (
     ClassifierTraits,

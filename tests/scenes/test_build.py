@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from tint_sumo.errors import InputError
-from tint_sumo.files import shipped
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import shipped
 from tint_sumo.scenes import SCENES, T_INTERSECTION, find_scene
 from tint_sumo.scenes.build import CONFIG_FILE, NET_FILE, scene_files, write_scene
 from tint_sumo.scenes.network import sumo_program

@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from tint_sumo import ENV_IDS
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SCENES, T_INTERSECTION, EgoTask, Route, find_scene
 from tint_sumo.scenes.geometry import POSE, SPACING_M, measure_distances_m, place
 from tint_sumo.scenes.layout import Layout, layout

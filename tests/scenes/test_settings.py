@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
-from tests.scenes.own_networks import OwnNetwork
+from tests.scenes.networks import OwnNetwork
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DRIVER_PROFILES, POPULATIONS, Population, read_population
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.structures import plain
 from tint_sumo.scenes import (
     ALL_SCENES,
     SCENES,
@@ -20,7 +21,6 @@ from tint_sumo.scenes import (
     read_scene,
     scene_settings,
 )
-from tint_sumo.structures import plain
 
 SHY = {
     "name": "shy",

@@ -10,11 +10,11 @@ import libsumo
 import pytest
 from traci.storage import Storage
 
-from tests.scenes.own_networks import OwnNetwork
+from tests.scenes.networks import OwnNetwork
 from tests.simulation.scenes import T
-from tint_sumo.errors import InputError
-from tint_sumo.simulation.own import OwnSimulation, sumo_options
+from tint_sumo.core.errors import InputError
 from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation.sumocfg import OwnSimulation, sumo_options
 
 
 def test_a_second_simulation_in_the_process_takes_traci_and_libsumo_comes_back() -> None:

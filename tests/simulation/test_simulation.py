@@ -8,13 +8,13 @@ import pytest
 
 from tests.simulation.scenes import GO, LOWER, STEP_S, UPPER, T, scene
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, EgoController, Idm, Population, Traffic
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SCENES, Scene, find_scene
 from tint_sumo.scenes.geometry import measure_distances_m
 from tint_sumo.simulation.demand import PlacedVehicle
 from tint_sumo.simulation.ego import EgoRules, is_unsafe
-from tint_sumo.simulation.link import NO_COLLISION_CHECK, SUMO_COLLISION_CHECK
 from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation.sumo import NO_COLLISION_CHECK, SUMO_COLLISION_CHECK
 
 SLOTS = ("present", "route", "front_m", "member", "vehicle_number")
 EGOS = ("front_m", "speed_mps", "has_claimed", "collided")

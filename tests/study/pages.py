@@ -3,12 +3,13 @@
 from pathlib import Path
 
 from tests.study.scenes import given, write_results
-from tint_sumo.files import write_json, write_text
-from tint_sumo.study.budgets import ALL_MIXES, Conditions
+from tint_sumo.config import ALL_MIXES
+from tint_sumo.core.files import write_json, write_text
+from tint_sumo.methods.training import CURVE_FILE
+from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE
 from tint_sumo.study.page import write_page
 from tint_sumo.study.report import StudyReport, write_report
-from tint_sumo.study.training import CURVE_FILE
 
 CURVE = "decisions,success,timeout,collision\n64,0.1,0.4,0.5\n128,0.6,0.1,0.3\n"
 WORLDS = (Conditions(ALL_MIXES), Conditions(ALL_MIXES, 0.1))

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from tint_sumo.config import Share
-from tint_sumo.files import write_json
-from tint_sumo.study.budgets import ALL_MIXES, Conditions
-from tint_sumo.study.evaluation import Case, Evaluation
+from tint_sumo.config import ALL_MIXES, Share
+from tint_sumo.core.files import write_json
+from tint_sumo.methods.evaluation import Case, Evaluation
+from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.results import GIVEN, TRAINED, Measured, Result
 

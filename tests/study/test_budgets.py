@@ -4,10 +4,10 @@ from dataclasses import asdict
 import pytest
 
 from tint_sumo import traits
-from tint_sumo.config import P_CONSERVATIVE, Idm, PpoSettings, TraitSettings, ends, is_share
-from tint_sumo.study.budgets import ALL_MIXES, BUDGETS, TRAIT_BUDGETS, Conditions
-from tint_sumo.study.methods import Learned, find_method
-from tint_sumo.study.training import SNAPSHOTS_PERCENT
+from tint_sumo.config import ALL_MIXES, P_CONSERVATIVE, TRAIT_BUDGETS, Idm, PpoSettings, TraitSettings, ends, is_share
+from tint_sumo.methods.registry import Learned, find_method
+from tint_sumo.methods.training import SNAPSHOTS_PERCENT
+from tint_sumo.study.budgets import BUDGETS, Conditions
 
 
 @pytest.mark.parametrize("name", BUDGETS)

@@ -2,13 +2,14 @@ from pathlib import Path
 
 import pytest
 
-from tint_sumo.errors import InputError
-from tint_sumo.progress import Progress
+from tint_sumo.config import ALL_MIXES
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.progress import Progress
+from tint_sumo.methods.evaluation import CASES
 from tint_sumo.study import budgets
-from tint_sumo.study.budgets import ALL_MIXES, Conditions
+from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling import ceiling
 from tint_sumo.study.ceiling_job import CEILINGS_FILE, CeilingJob, read_ceilings
-from tint_sumo.study.evaluation import CASES
 
 
 def test_there_is_a_ceiling_for_each_mix_of_the_training_s_world(tmp_path: Path) -> None:

@@ -10,12 +10,13 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from tests.study.scenes import given, trained
+from tint_sumo.config import ALL_MIXES
 from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.methods.registry import METHODS
 from tint_sumo.study import figures
-from tint_sumo.study.budgets import ALL_MIXES, Conditions
+from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.figures import plot_bars, plot_curves, plot_worlds
-from tint_sumo.study.methods import METHODS
-from tint_sumo.study.rows import at_mixes, over_all_mixes, tabulate
+from tint_sumo.study.summary import at_mixes, over_all_mixes, tabulate
 
 AS_TRAINED = Conditions(ALL_MIXES)
 WORLDS = (

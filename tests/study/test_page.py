@@ -13,17 +13,20 @@ import numpy as np
 import pytest
 
 from tests.study.scenes import given, trained, write_results
-from tint_sumo.errors import InputError
-from tint_sumo.files import write_text
-from tint_sumo.progress import silent
+from tint_sumo.config import ALL_MIXES
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import write_text
+from tint_sumo.core.progress import silent
+from tint_sumo.films.driving import Moment, drive_case
+from tint_sumo.films.trait_probe import TraitReader
+from tint_sumo.methods.evaluation import Case, Evaluation
+from tint_sumo.methods.loading import load_policy
+from tint_sumo.methods.registry import METHODS
 from tint_sumo.scenes import SCENES, find_scene
 from tint_sumo.scenes.geometry import POSE
 from tint_sumo.scenes.layout import layout
-from tint_sumo.study.budgets import ALL_MIXES, Conditions
-from tint_sumo.study.driving import Moment, drive_case
-from tint_sumo.study.evaluation import Case, Evaluation
-from tint_sumo.study.loading import load_policy
-from tint_sumo.study.methods import METHODS
+from tint_sumo.study.budgets import Conditions
+from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.page import write_page
 from tint_sumo.study.page.charts import curve_chart, outcome_chart, world_charts
 from tint_sumo.study.page.choosing import MOST_CASES, Choice, Shown, choose, choose_cases
@@ -32,10 +35,8 @@ from tint_sumo.study.page.findings import what_came_out
 from tint_sumo.study.page.html import json_data, packed, table
 from tint_sumo.study.page.recording import MISSING, UNITS, Recording, RecordJob, encode, read_episodes
 from tint_sumo.study.page.roads import scene_shapes
-from tint_sumo.study.policy_jobs import read_curves
 from tint_sumo.study.report import write_report
-from tint_sumo.study.rows import tabulate
-from tint_sumo.study.trait_reader import TraitReader
+from tint_sumo.study.summary import tabulate
 
 
 def outcomes(*shorts: str) -> Evaluation:

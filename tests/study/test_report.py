@@ -5,16 +5,17 @@ import pytest
 from PIL import Image
 
 from tests.study.scenes import given, trained, write_results
-from tint_sumo.errors import InputError
-from tint_sumo.files import write_json, write_text
-from tint_sumo.study.budgets import ALL_MIXES, Conditions
+from tint_sumo.config import ALL_MIXES
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import write_json, write_text
+from tint_sumo.core.statistics import Rate, difference_interval, rate_interval
+from tint_sumo.methods.training import CURVE_FILE
+from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE
 from tint_sumo.study.report import StudyReport, result_tables, to_markdown, write_report
 from tint_sumo.study.results import Result
 from tint_sumo.study.results_csv import read_csv, to_csv
-from tint_sumo.study.rows import Row, tabulate
-from tint_sumo.study.statistics import Rate, difference_interval, rate_interval
-from tint_sumo.study.training import CURVE_FILE
+from tint_sumo.study.summary import Row, tabulate
 
 WORLD, NOISY, HALF = Conditions(ALL_MIXES), Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, percent=50)
 CURVE = "decisions,success,timeout,collision\n64,0.1,0.4,0.5\n128,0.6,0.1,0.3\n"

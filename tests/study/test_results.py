@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 
 from tests.study.scenes import given, trained, write_results
-from tint_sumo.config import Idm
-from tint_sumo.errors import InputError
-from tint_sumo.study.budgets import ALL_MIXES, Conditions
-from tint_sumo.study.evaluation import TUNING_CASES
+from tint_sumo.config import ALL_MIXES, Idm
+from tint_sumo.core.errors import InputError
+from tint_sumo.methods.evaluation import TUNING_CASES
+from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.report import write_report
 from tint_sumo.study.results import Result, read_results

@@ -11,18 +11,19 @@ import pytest
 
 from tests.study.scenes import trained
 from tint_sumo import traits
+from tint_sumo.comparisons import traits_report
+from tint_sumo.config import ALL_MIXES
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import RUN_FILE, claim_folder, shipped, write_json
+from tint_sumo.core.progress import silent
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import read_manifest
-from tint_sumo.errors import InputError
-from tint_sumo.files import RUN_FILE, claim_folder, shipped, write_json
+from tint_sumo.methods.loading import load_policy
 from tint_sumo.policy.storage import read_versions
-from tint_sumo.progress import silent
 from tint_sumo.scenes import described
-from tint_sumo.study import trait_report
-from tint_sumo.study.budgets import ALL_MIXES, Conditions
+from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE, read_ceilings
 from tint_sumo.study.folders import RESULTS
-from tint_sumo.study.loading import load_policy
 from tint_sumo.study.page.recording import Recording, read_episodes
 from tint_sumo.study.page.writing import read_scene_of
 from tint_sumo.study.results import Result
@@ -94,13 +95,13 @@ def test_recorded_episodes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["comparison", "continuous"])
 def test_results_of_trait_studies(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trait_report, "plot_noise", lambda *_: None)
+    monkeypatch.setattr(traits_report, "plot_noise", lambda *_: None)
     found = TraitAccuracy(0.9, 0.9, 0.5, 10, None, None, {"2-5": Part(0.9, 10)}, {"with_leader": Part(None, 0)})
     case = {"kind": "comparison", "method": "vae", "noise_m": 0.0, "seed": 0, "training_windows": 20, "training_s": 1.0}
     write_json(tmp_path / RESULTS / "comparison.json", {**case, **asdict(found), "by_p": {"0.4": 1.0}})
     continuous = {"kind": "continuous", "method": "vae", "latent_size": 2, "seed": 0, "r2": {"min_gap_m": 0.5}}
     write_json(tmp_path / RESULTS / "continuous.json", continuous)
-    check(tmp_path / RESULTS / f"{kind}.json", lambda: trait_report.write_trait_report(tmp_path))
+    check(tmp_path / RESULTS / f"{kind}.json", lambda: traits_report.write_trait_report(tmp_path))
 
 
 def test_settings_of_runs(tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from tint_sumo.config import TraitSettings
+from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.windows import split_by_episode
-from tint_sumo.errors import InputError
 from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, encode_windows, evaluate, linear_r2
 from tint_sumo.traits.vae import Vae
 

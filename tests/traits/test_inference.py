@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from tint_sumo.config import TraitSettings
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import shipped
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.schema import TRAJECTORIES
 from tint_sumo.dataset.windows import load_windows
-from tint_sumo.errors import InputError
-from tint_sumo.files import shipped
 from tint_sumo.traits import TRAIT_METHODS, load
 from tint_sumo.traits.cross_window import fuse
 from tint_sumo.traits.evaluation import encode_windows

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tint_sumo.config import WINDOW_STEPS
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import shipped
 from tint_sumo.dataset.windows import Windows
-from tint_sumo.errors import InputError
-from tint_sumo.files import shipped
 from tint_sumo.traits.input_range import MARGIN_M, InputRange
 from tint_sumo.traits.storage import read_card
 

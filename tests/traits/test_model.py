@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from tint_sumo.config import TraitSettings
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.traits import TRAIT_METHODS
 from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.model import FEATURE_SPREAD, displacement_and_gap, find_trait_method, register, valid_steps

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.traits import load, storage
 from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.storage import add_to_card, read_card, save

@@ -7,8 +7,8 @@ import safetensors.torch
 import torch
 
 from tests.bombs import BOMBS, bomb
-from tint_sumo.checkpoints import CHECKPOINT_FILE, PICKLES
-from tint_sumo.errors import DivergedError, InputError
+from tint_sumo.core.checkpoints import CHECKPOINT_FILE, PICKLES
+from tint_sumo.core.errors import DivergedError, InputError
 from tint_sumo.traits import TRAIT_METHODS, load, training
 from tint_sumo.traits.classifier import Classifier
 from tint_sumo.traits.evaluation import evaluate

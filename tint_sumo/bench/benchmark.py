@@ -24,17 +24,16 @@ import torch
 from tint_sumo import ENV_IDS
 from tint_sumo.bench.measuring import Clocks, Turn, turns_apart
 from tint_sumo.bench.policies import DECISION_METHOD, INSTALL_SB3_CONTRIB, decision_ms, training_speed
-from tint_sumo.config import WINDOW_STEPS, PpoSettings
+from tint_sumo.config import PPO_BUDGETS, TRAIT_BUDGETS, WINDOW_STEPS, PpoSettings
+from tint_sumo.core.determinism import single_threaded
+from tint_sumo.core.progress import make_bar
 from tint_sumo.dataset.windows import Windows
-from tint_sumo.determinism import single_threaded
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.sb3 import SceneVecEnv
-from tint_sumo.progress import make_bar
 from tint_sumo.scenes import T_INTERSECTION, find_scene
-from tint_sumo.simulation.link import SUMO_COLLISION_CHECK
 from tint_sumo.simulation.simulation import Simulation
-from tint_sumo.study.budgets import BUDGETS, TRAIT_BUDGETS
-from tint_sumo.timing import StepPart
+from tint_sumo.simulation.sumo import SUMO_COLLISION_CHECK
+from tint_sumo.simulation.timing import StepPart
 from tint_sumo.traits import TRAIT_METHODS
 from tint_sumo.traits.training import train
 
@@ -59,7 +58,7 @@ class Sizes:
     gym_turn_steps: int = 1_000  # steps of the single environment
     windows: int = 100_000
     training_windows: int = 40_000
-    ppo: PpoSettings = BUDGETS["full"].ppo
+    ppo: PpoSettings = PPO_BUDGETS["full"]
     rollouts: int = 3  # rollouts of the policy's training, updates included
     decisions: int = 1_000  # decisions of one policy with one intersection
     memory_env_steps: tuple[int, int] = (100_000, 2_000_000)  # memory growth is measured between these
@@ -71,7 +70,7 @@ QUICK = Sizes(
     gym_turn_steps=500,
     windows=10_000,
     training_windows=5_000,
-    ppo=replace(BUDGETS["full"].ppo, n_envs=64, n_minibatches=4),  # half a rollout, minibatches as large as ever
+    ppo=replace(PPO_BUDGETS["full"], n_envs=64, n_minibatches=4),  # half a rollout, minibatches as large as ever
     rollouts=2,
     decisions=300,
     memory_env_steps=(20_000, 100_000),

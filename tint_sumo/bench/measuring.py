@@ -6,8 +6,8 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
-from tint_sumo.processes import answer, start_worker, told
-from tint_sumo.timing import marked_methods
+from tint_sumo.core.processes import answer, start_worker, told
+from tint_sumo.simulation.timing import marked_methods
 
 Turn = Callable[[], float]  # measures once more and returns what it found
 

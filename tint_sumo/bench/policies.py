@@ -14,13 +14,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits
 from tint_sumo.bench.measuring import Clocks, Turn, turns_apart
-from tint_sumo.config import PpoSettings
-from tint_sumo.determinism import single_threaded
+from tint_sumo.config import ALL_MIXES, PpoSettings
+from tint_sumo.core.determinism import single_threaded
 from tint_sumo.envs.sb3 import SceneVecEnv
+from tint_sumo.methods.registry import find_learned
+from tint_sumo.methods.training import new_model, training_venv
 from tint_sumo.policy import ActionRepeat, GruPolicy, StreamingTraits, TraitObservation
-from tint_sumo.study.budgets import ALL_MIXES
-from tint_sumo.study.methods import find_learned
-from tint_sumo.study.training import new_model, training_venv
 
 INSTALL_SB3_CONTRIB = "sb3-contrib is not installed: pip install sb3-contrib"
 DECISION_METHOD = (

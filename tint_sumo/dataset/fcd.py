@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.files import whole_file
+from tint_sumo.core.files import whole_file
 from tint_sumo.scenes.geometry import POSE, place
 from tint_sumo.scenes.layout import Layout
 

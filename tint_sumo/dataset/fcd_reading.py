@@ -15,8 +15,8 @@ from xml.parsers import expat
 import numpy as np
 import pandas as pd
 
-from tint_sumo.errors import InputError
-from tint_sumo.reading import TABLE_BYTES, is_gzipped, require_file
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.reading import TABLE_BYTES, is_gzipped, require_file
 
 _NAMES = {  # names of the columns in SUMO's tables
     "timestep_time": "time_s",

@@ -18,11 +18,11 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import whole_file
+from tint_sumo.core.progress import make_bar
 from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, read_shards
 from tint_sumo.dataset.windows import drivers_of, own_vtypes, read_manifest
-from tint_sumo.errors import InputError
-from tint_sumo.files import whole_file
-from tint_sumo.progress import make_bar
 
 RESOLUTION = 0.01  # m, m/s or s: values are rounded to multiples of it
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)

@@ -9,8 +9,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from tint_sumo.config import NO_LEADER_GAP_M
-from tint_sumo.errors import InputError
-from tint_sumo.scenes.own import read_net
+from tint_sumo.core.errors import InputError
+from tint_sumo.scenes.sumocfg import read_net
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from tint_sumo.config import Population, Share, find_population, population_name
+from tint_sumo.core.structures import plain
 from tint_sumo.dataset.fcd import write_fcd
 from tint_sumo.dataset.schema import FCD, SCHEMA_VERSION, TABLES, TRAJECTORIES, read_shard, shard_file, shard_path
 from tint_sumo.dataset.shards import (
@@ -21,12 +22,11 @@ from tint_sumo.dataset.shards import (
     shard_contents,
     write_tables,
 )
-from tint_sumo.executors import Workers
+from tint_sumo.jobs import Workers
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
 from tint_sumo.scenes.geometry import Floats, Numbers
 from tint_sumo.scenes.layout import layout
 from tint_sumo.simulation.simulation import Simulation
-from tint_sumo.structures import plain
 
 EPISODES_PER_SHARD = 16
 

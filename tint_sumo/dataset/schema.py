@@ -16,8 +16,8 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tint_sumo.errors import InputError
-from tint_sumo.reading import TABLE_BYTES, require_file
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.reading import TABLE_BYTES, require_file
 
 SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"

@@ -17,8 +17,13 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tint_sumo.changes import write_files
 from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, WINDOW_STEPS
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.file_changes import write_files
+from tint_sumo.core.files import claim_folder, whole_file, write_json
+from tint_sumo.core.progress import make_bar
+from tint_sumo.core.provenance import versions
+from tint_sumo.core.stores import Store, is_url, working_folder
 from tint_sumo.dataset.schema import (
     DRIVER_SCHEMA,
     DRIVERS,
@@ -33,12 +38,7 @@ from tint_sumo.dataset.schema import (
     shard_path,
 )
 from tint_sumo.dataset.windows import read_manifest
-from tint_sumo.errors import InputError
-from tint_sumo.executors import Executor, Work, Workers, executor_of
-from tint_sumo.files import claim_folder, whole_file, write_json
-from tint_sumo.progress import make_bar
-from tint_sumo.provenance import versions
-from tint_sumo.stores import Store, is_url, working_folder
+from tint_sumo.jobs import Executor, Work, Workers, executor_of
 
 EPISODE_STEPS = 500
 _WINDOWS_KEY = b"tint_sumo.windows"

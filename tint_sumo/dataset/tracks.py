@@ -7,11 +7,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from tint_sumo.config import STEP_S, VehicleShape
+from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.fcd import EPISODE_PERIOD_S
 from tint_sumo.dataset.fcd_reading import read_fcd
 from tint_sumo.dataset.leaders import Lanes, gaps_m
 from tint_sumo.dataset.schema import TRAJECTORIES, read_shard, read_shard_metadata
-from tint_sumo.errors import InputError
 
 MAX_STEP_S = 1.0  # a straight line between farther points would be no driving any more
 _POS_DIGIT_M = 0.01  # SUMO's default precision

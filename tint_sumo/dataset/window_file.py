@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.config import WINDOW_STEPS
+from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.windows import PART, Windows
-from tint_sumo.errors import InputError
 
 _RECORD = np.dtype(
     [

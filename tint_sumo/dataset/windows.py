@@ -18,11 +18,11 @@ from tint_sumo.config import (
     TrafficSeed,
     read_population,
 )
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import read_json
+from tint_sumo.core.ranges import Range
+from tint_sumo.core.structures import FieldError, build
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, SCHEMA_VERSION, TRAJECTORIES, read_shards
-from tint_sumo.errors import InputError
-from tint_sumo.files import read_json
-from tint_sumo.ranges import Range
-from tint_sumo.structures import FieldError, build
 
 _DRIVERS_PER_EPISODE = 100_000
 _Count = Annotated[int, Range(0, 10**12)]

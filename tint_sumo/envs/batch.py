@@ -10,11 +10,11 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from tint_sumo.core.errors import InputError, shown
 from tint_sumo.envs.episodes import Episodes, TaskSettings
 from tint_sumo.envs.rendering import render_scene
 from tint_sumo.envs.rows import Rows, outcome_name
-from tint_sumo.errors import InputError, shown
-from tint_sumo.timing import StepPart, does
+from tint_sumo.simulation.timing import StepPart, does
 
 
 @dataclass(frozen=True)

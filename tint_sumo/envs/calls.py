@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 
 _SHOWN = 80  # characters of a value that is refused
 

@@ -22,6 +22,9 @@ from tint_sumo.config import (
     TauS,
     TimeS,
 )
+from tint_sumo.core.errors import InputError, shown
+from tint_sumo.core.ranges import require_ranges
+from tint_sumo.core.structures import require_fields
 from tint_sumo.envs.rows import (
     BOUND,
     COLLISION,
@@ -37,13 +40,10 @@ from tint_sumo.envs.rows import (
     observe_tracks,
     row_type,
 )
-from tint_sumo.errors import InputError, shown
-from tint_sumo.ranges import require_ranges
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, find_scene
 from tint_sumo.scenes.geometry import Floats
-from tint_sumo.simulation.own import make_simulation
-from tint_sumo.structures import require_fields
-from tint_sumo.timing import StepPart, does
+from tint_sumo.simulation.sumocfg import make_simulation
+from tint_sumo.simulation.timing import StepPart, does
 
 _SEED_LIMIT = 2**63
 _STEP_TOLERANCE = 1e-6  # of decision_s in steps, for numbers such as 0.3 / 0.1

@@ -9,13 +9,13 @@ import shapely
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import View
 from tint_sumo.scenes.geometry import SPACING_M, Floats
 from tint_sumo.scenes.layout import Layout
-from tint_sumo.scenes.own import read_net
-from tint_sumo.simulation.own import OwnSimulation
+from tint_sumo.scenes.sumocfg import read_net
 from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation.sumocfg import OwnSimulation
 
 RENDER_FPS = 10
 _WIDTH = 736  # pixels

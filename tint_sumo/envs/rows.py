@@ -7,11 +7,11 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.compiling import compiled
 from tint_sumo.config import RewardPreset
+from tint_sumo.core.compiling import compiled
 from tint_sumo.scenes.geometry import Bools, Floats, Numbers, Poses
-from tint_sumo.scenes.own import OwnScene
 from tint_sumo.scenes.scene import Scene
+from tint_sumo.scenes.sumocfg import OwnScene
 
 Observation = dict[str, NDArray[np.float32]]
 OBSERVATION_KEYS = ("ego", "vehicles", "mask")

@@ -15,7 +15,7 @@ from tint_sumo.envs.episodes import require_arguments
 from tint_sumo.envs.rows import end_info, fields_of, observation_of
 from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.scenes import T_INTERSECTION, AnyScene
-from tint_sumo.timing import StepPart, does
+from tint_sumo.simulation.timing import StepPart, does
 
 
 class SceneVecEnv(VecEnv):

@@ -17,8 +17,8 @@ from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, requi
 from tint_sumo.envs.rows import OBSERVATION_KEYS, Observation, fields_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
 from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
-from tint_sumo.simulation.own import OwnSimulation
 from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation.sumocfg import OwnSimulation
 
 
 class SceneEnv(gymnasium.Env[Any, Any]):

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs.batch import Batch, Ended, LocalBatch, Snapshot, checked_snapshots
 from tint_sumo.envs.calls import (
     Phase,
@@ -36,7 +37,6 @@ from tint_sumo.envs.rows import (
     step_info,
 )
 from tint_sumo.envs.workers import WorkerBatch
-from tint_sumo.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, OwnScene, Scene
 
 MOST_ENVS = 100_000  # environments of one vector: beyond, memory would run out before anything is said

@@ -9,7 +9,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 
 _INSTEAD = 'use render_mode="rgb_array", or make a film with tint-sumo render'
 

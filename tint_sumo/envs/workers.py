@@ -21,10 +21,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from tint_sumo.core.processes import answer, start_worker, told
 from tint_sumo.envs.batch import Ended, LocalBatch, Snapshot
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import Rows, row_type
-from tint_sumo.processes import answer, start_worker, told
 from tint_sumo.simulation.connection import libsumo_is_free
 
 _ENDING_S = 10.0  # more than enough for a step, and to close a simulation

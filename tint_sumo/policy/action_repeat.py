@@ -6,7 +6,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 
 _STOP = 0  # action of an episode that began within a decision
 

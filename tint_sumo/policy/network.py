@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import Tensor, nn
 
 from tint_sumo.config import PolicySettings
-from tint_sumo.errors import InputError, NotFiniteError
+from tint_sumo.core.errors import InputError, NotFiniteError
 from tint_sumo.policy.gru import ResetGru
 from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS
 

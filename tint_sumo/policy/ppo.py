@@ -23,8 +23,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
 from tint_sumo.config import PpoSettings
-from tint_sumo.errors import DivergedError, InputError
-from tint_sumo.files import whole_file
+from tint_sumo.core.errors import DivergedError, InputError
+from tint_sumo.core.files import whole_file
 from tint_sumo.policy.buffer import SequenceBuffer, Sequences, buffer_class
 from tint_sumo.policy.loss import Decisions, ppo_loss
 from tint_sumo.policy.network import GruPolicy

@@ -12,16 +12,16 @@ from gymnasium import spaces
 from torch import Tensor
 
 from tint_sumo.config import PolicySettings, Slots
-from tint_sumo.determinism import preserved_random_state
+from tint_sumo.core.determinism import preserved_random_state
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import read_json, write_json
+from tint_sumo.core.ranges import Range
+from tint_sumo.core.structures import FieldError, build
+from tint_sumo.core.weights import read_weights, write_weights
 from tint_sumo.envs.episodes import observation_space
-from tint_sumo.errors import InputError
-from tint_sumo.files import read_json, write_json
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS, trait_space
 from tint_sumo.policy.trait_sources import OracleTraits
-from tint_sumo.ranges import Range
-from tint_sumo.structures import FieldError, build
-from tint_sumo.weights import read_weights, write_weights
 
 _NETWORK = "network"  # the card's entry with all that is needed to build the network
 

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.policy.trait_sources import Frame, Observation, TraitSource
 
 TRAITS, TRUE_TRAITS = "traits", "true_traits"

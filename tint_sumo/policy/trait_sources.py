@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from tint_sumo.config import LATENT_SIZE, NO_LEADER_GAP_M, STEP_S, WINDOW_STEPS
+from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.windows import cut_windows
-from tint_sumo.errors import InputError
 from tint_sumo.traits.classifier import Classifier
 from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.model import TraitModel

@@ -4,7 +4,6 @@ from tint_sumo.scenes import four_way as four_way
 from tint_sumo.scenes import on_ramp as on_ramp
 from tint_sumo.scenes import roundabout as roundabout
 from tint_sumo.scenes import t_intersection as t_intersection
-from tint_sumo.scenes.own import OwnScene, from_sumocfg
 from tint_sumo.scenes.scene import (
     ALL_SCENES,
     SCENES,
@@ -17,6 +16,7 @@ from tint_sumo.scenes.scene import (
     find_scene,
 )
 from tint_sumo.scenes.settings import AnyScene, described, read_described, read_scene, scene_settings
+from tint_sumo.scenes.sumocfg import OwnScene, from_sumocfg
 
 __all__ = [
     "ALL_SCENES",

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from tint_sumo.errors import InputError
-from tint_sumo.files import require_output_folder, write_text
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import require_output_folder, write_text
 from tint_sumo.scenes.drivers import DISTRIBUTION_ID, vtypes_xml
 from tint_sumo.scenes.layout import EGO
 from tint_sumo.scenes.network import REPLICA_SPACING_M, build_network, name, plain_xml

@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tint_sumo.compiling import compiled
+from tint_sumo.core.compiling import compiled
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from tint_sumo.config import Population, Traffic, VehicleShape
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.geometry import POSE, SPACING_M, Floats, Poses, along, place, resample
 from tint_sumo.scenes.network import Point, build_network, name, plain_xml
 from tint_sumo.scenes.scene import Scene

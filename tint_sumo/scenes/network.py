@@ -15,7 +15,7 @@ from pathlib import Path
 
 import sumo
 
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 
 Point = tuple[float, float]  # x and y in m
 

@@ -21,13 +21,13 @@ from tint_sumo.config import (
     Traffic,
     VehicleShape,
 )
-from tint_sumo.errors import InputError, find_named, shown
-from tint_sumo.ranges import require_ranges
+from tint_sumo.core.errors import InputError, find_named, shown
+from tint_sumo.core.ranges import require_ranges
 from tint_sumo.scenes.digest import scene_digest
 from tint_sumo.scenes.network import Network, Point
 
 if TYPE_CHECKING:
-    from tint_sumo.scenes.own import OwnScene
+    from tint_sumo.scenes.sumocfg import OwnScene
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,21 @@ from tint_sumo.config import (
     VehicleShape,
     WarmUpS,
 )
-from tint_sumo.errors import InputError
-from tint_sumo.ranges import Range, require_ranges
-from tint_sumo.scenes.own import OwnScene, from_sumocfg
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.ranges import Range, require_ranges
+from tint_sumo.core.structures import (
+    FieldError,
+    Many,
+    Where,
+    build,
+    is_mapping,
+    overlay,
+    plain,
+    require_base,
+    require_known,
+)
 from tint_sumo.scenes.scene import ALL_SCENES, SCENES, T_INTERSECTION, Scene, digest_of, find_scene, require_scene_name
-from tint_sumo.structures import FieldError, Many, Where, build, is_mapping, overlay, plain, require_base, require_known
+from tint_sumo.scenes.sumocfg import OwnScene, from_sumocfg
 
 RouteM = Annotated[float, Range(0.0, 1e6)]
 AnyScene = str | Scene | OwnScene

@@ -22,7 +22,7 @@ from traci import main as traci  # with LIBSUMO_AS_TRACI the package itself is l
 from traci.exceptions import FatalTraCIError
 
 from tint_sumo.config import Backend
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.network import sumo_program
 
 _CONNECT_TRIES, _CONNECT_WAIT_S = 600, 0.05  # sumo takes a moment to listen

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tint_sumo.compiling import compiled
+from tint_sumo.core.compiling import compiled
 from tint_sumo.scenes.drivers import DriverMember
 from tint_sumo.scenes.geometry import Bools, Floats, Numbers
 from tint_sumo.scenes.layout import Layout

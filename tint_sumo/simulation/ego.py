@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tint_sumo.compiling import compiled
+from tint_sumo.core.compiling import compiled
 from tint_sumo.scenes.geometry import POSE, SPACING_M, Bools, Floats, Numbers, Poses, measure_distances_m, place
 from tint_sumo.scenes.layout import Layout
-from tint_sumo.scenes.own import OwnScene
 from tint_sumo.scenes.scene import Scene
+from tint_sumo.scenes.sumocfg import OwnScene
 from tint_sumo.simulation.slots import EMPTY, Slots
-from tint_sumo.timing import StepPart, does
+from tint_sumo.simulation.timing import StepPart, does
 
 _STEP_MARGIN_M = 1.0  # more than a vehicle and the ego come closer in a step
 

@@ -10,17 +10,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from tint_sumo.config import Backend
-from tint_sumo.errors import InputError
+from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.drivers import members
 from tint_sumo.scenes.geometry import Floats, Numbers, find_leaders
 from tint_sumo.scenes.layout import layout
 from tint_sumo.scenes.scene import Scene
 from tint_sumo.simulation.demand import Demand, PlacedVehicle
 from tint_sumo.simulation.ego import Egos
-from tint_sumo.simulation.link import NO_COLLISION_CHECK, SumoLink
 from tint_sumo.simulation.slots import Slots
+from tint_sumo.simulation.sumo import NO_COLLISION_CHECK, SumoLink
+from tint_sumo.simulation.timing import StepPart, does
 from tint_sumo.simulation.yielding import Yielding
-from tint_sumo.timing import StepPart, does
 
 
 class Simulation:

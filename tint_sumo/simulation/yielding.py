@@ -6,9 +6,9 @@ from tint_sumo.scenes.drivers import DriverMember
 from tint_sumo.scenes.geometry import Bools
 from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.ego import Egos
-from tint_sumo.simulation.link import SumoLink
 from tint_sumo.simulation.slots import Slots
-from tint_sumo.timing import StepPart, does
+from tint_sumo.simulation.sumo import SumoLink
+from tint_sumo.simulation.timing import StepPart, does
 
 
 class Yielding:

@@ -4,10 +4,13 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 from tint_sumo.config import (
+    ALL_MIXES,
     P_CONSERVATIVE,
+    PPO_BUDGETS,
+    SNAPSHOTS_PERCENT,
+    TRAIT_BUDGETS,
     Fraction,
     NoiseM,
-    PolicySettings,
     PpoSettings,
     Seed,
     Share,
@@ -17,12 +20,9 @@ from tint_sumo.config import (
     require_share,
     set_floats,
 )
-from tint_sumo.errors import InputError
-from tint_sumo.ranges import Range, require_ranges
-from tint_sumo.structures import Many
-
-ALL_MIXES: Share = (0.1, 0.9)  # P(conservative) is drawn from this range in every episode
-SNAPSHOTS_PERCENT = (25, 50)  # parts of a training after which the policy is kept, too
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.ranges import Range, require_ranges
+from tint_sumo.core.structures import Many
 
 
 @dataclass(frozen=True)
@@ -115,47 +115,6 @@ class Budget:
             )
 
 
-# A small network is as accurate here as the paper's, trains in minutes and encodes 768 windows in less than 2 ms.
-_FULL = TraitSettings(
-    embedding_sizes=(),
-    hidden_size=20,
-    encoder_output_size=32,
-    decoder_output_size=32,
-    learning_rate=3e-3,
-    batch_size=512,
-    epochs=3,
-)
-
-TRAIT_BUDGETS = {
-    "quick": replace(_FULL, batch_size=256, epochs=20),  # meant for some 30,000 windows
-    "full": _FULL,  # meant for the paper's 696,000
-    "paper": TraitSettings(),
-}
-
-# Chosen with one or two seeds on cases that are reported nowhere (set 1000); see the README's section on training.
-_FULL_PPO = PpoSettings(
-    n_envs=128,
-    n_steps=64,
-    n_epochs=4,
-    n_minibatches=8,
-    learning_rate=3e-3,
-    gamma=0.999,  # per decision of 0.4 s; with less, a small risk pays more than waiting for the next gap
-    ent_coef=0.01,
-    final_ent_coef=0.0,  # tests take the likeliest actions: what succeeds by chance must become likely
-    vf_coef=0.02,  # returns are near 8: with more, their errors drown the actor's gradient in the shared layers
-    total_steps=1_600_000,
-    action_repeat=4,
-    policy=PolicySettings(
-        position_gain=6.0,
-        embedding_sizes=(64, 64),
-        score_sizes=(64,),
-        context_size=64,
-        joint_sizes=(64, 64),
-        hidden_size=64,
-        head_sizes=(64,),
-    ),
-)
-
 _TRAINED = (
     "no_labels",
     "morton",
@@ -172,14 +131,14 @@ BUDGETS = {
     "quick": Budget(
         windows=30_000,
         traits=TRAIT_BUDGETS["quick"],
-        ppo=replace(_FULL_PPO, n_envs=64, total_steps=200_000),
+        ppo=PPO_BUDGETS["quick"],
         seeds=(0,),
         trials=(Trials(tuple(Conditions(p) for p in P_CONSERVATIVE), 200),),
         with_shipped=True,
     ),
     "full": Budget(
         traits=None,
-        ppo=_FULL_PPO,
+        ppo=PPO_BUDGETS["full"],
         methods=("always_go", "ttc", *_TRAINED),
         seeds=(0, 1, 2, 3),
         trials=(
@@ -202,6 +161,3 @@ BUDGETS = {
         trials=(Trials(tuple(Conditions(p) for p in P_CONSERVATIVE), 500),),  # paper IV-C
     ),
 }
-
-
-PPO_BUDGETS = {name: budget.ppo for name, budget in BUDGETS.items()}

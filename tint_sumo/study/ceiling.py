@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import Share
 from tint_sumo.envs.episodes import episode_seed
+from tint_sumo.methods.evaluation import BATCH, case_seed
 from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene
 from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.simulation import Simulation
-from tint_sumo.study.evaluation import BATCH, case_seed
 
 
 def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str | Scene = T_INTERSECTION) -> float:
@@ -22,7 +22,7 @@ def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str | Sc
     takes risks can: it may slip through before an aggressive driver.
 
     Args:
-        p_conservative, episodes, seed: of the cases, see ``tint_sumo.study.evaluation.evaluate``.
+        p_conservative, episodes, seed: of the cases, see ``tint_sumo.methods.evaluation.evaluate``.
         scene: name of the scene, or a scene of one's own.
     """
     played = find_scene(scene)

@@ -4,15 +4,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tint_sumo.config import is_share
-from tint_sumo.files import damaged, read_record, write_json
-from tint_sumo.percentages import percent
-from tint_sumo.progress import Progress, Report
-from tint_sumo.reading import RESULT_BYTES
+from tint_sumo.core.files import damaged, read_record, write_json
+from tint_sumo.core.percentages import percent
+from tint_sumo.core.progress import Progress, Report
+from tint_sumo.core.reading import RESULT_BYTES
+from tint_sumo.jobs.status import Title
+from tint_sumo.methods.evaluation import CASES
 from tint_sumo.scenes import T_INTERSECTION, Scene
-from tint_sumo.standings import Title
 from tint_sumo.study.budgets import Trials
 from tint_sumo.study.ceiling import ceiling
-from tint_sumo.study.evaluation import CASES
 
 CEILINGS_FILE = "ceilings.json"
 

@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tint_sumo.config import ends
+from tint_sumo.core.files import whole_file
+from tint_sumo.core.percentages import percent
 from tint_sumo.envs.rows import OUTCOMES
-from tint_sumo.files import whole_file
-from tint_sumo.percentages import percent
-from tint_sumo.study.methods import METHODS, look_of
-from tint_sumo.study.policy_jobs import smoothed_percent
-from tint_sumo.study.rows import WORLDS, Summary, by_title, varied
+from tint_sumo.methods.registry import METHODS, look_of
+from tint_sumo.study.jobs import smoothed_percent
+from tint_sumo.study.summary import WORLDS, Summary, by_title, varied
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
 INK = {"success": "white", "timeout": "black", "collision": "white"}  # colours of the numbers on these colours

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tint_sumo.config import share_words
+from tint_sumo.core.files import write_text
+from tint_sumo.core.percentages import percent
+from tint_sumo.core.statistics import difference_interval
 from tint_sumo.envs.rows import OUTCOMES
-from tint_sumo.files import write_text
-from tint_sumo.percentages import percent
 from tint_sumo.study.ceiling_job import read_ceilings
 from tint_sumo.study.figures import plot_bars, plot_curves, plot_worlds
-from tint_sumo.study.policy_jobs import read_curves
+from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.results import read_results
 from tint_sumo.study.results_csv import Ceilings, to_csv
-from tint_sumo.study.rows import Row, Summary, at_mixes, by_method, by_title, over_all_mixes, tabulate
-from tint_sumo.study.statistics import difference_interval
+from tint_sumo.study.summary import Row, Summary, at_mixes, by_method, by_title, over_all_mixes, tabulate
 from tint_sumo.study.tables import Lines, Table
 
 

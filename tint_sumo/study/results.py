@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tint_sumo.config import Idm, NoiseM, Seed, Share, TauS, require_share
-from tint_sumo.errors import InputError
-from tint_sumo.files import read_record
-from tint_sumo.ranges import Range
-from tint_sumo.reading import RESULT_BYTES
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import read_record
+from tint_sumo.core.ranges import Range
+from tint_sumo.core.reading import RESULT_BYTES
+from tint_sumo.methods.evaluation import CASES, MAX_SEED, Case, Evaluation, StoredCase
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.evaluation import CASES, MAX_SEED, Case, Evaluation, StoredCase
 from tint_sumo.study.folders import RESULTS
 
 TRAINED, GIVEN = "trained", "given"  # origin of a policy: the study itself, or a rule or the package

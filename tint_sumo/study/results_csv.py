@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tint_sumo.config import Share, share_words
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.reading import RESULT_BYTES, read_file
+from tint_sumo.core.statistics import Interval
 from tint_sumo.envs.rows import OUTCOMES
-from tint_sumo.errors import InputError
-from tint_sumo.reading import RESULT_BYTES, read_file
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.rows import Summary
-from tint_sumo.study.statistics import Interval
+from tint_sumo.study.summary import Summary
 
 Ceilings = Mapping[float, float]  # share of the cases that a careful driver can finish, by P(conservative)
 

@@ -6,13 +6,13 @@ from pathlib import Path
 import torch
 
 from tint_sumo.config import TraitSettings
-from tint_sumo.executors.jobs import THREADS_PER_JOB
-from tint_sumo.files import write_json
-from tint_sumo.percentages import percent
-from tint_sumo.progress import Report
-from tint_sumo.standings import Title
+from tint_sumo.core.files import write_json
+from tint_sumo.core.percentages import percent
+from tint_sumo.core.progress import Report
+from tint_sumo.jobs.jobs import THREADS_PER_JOB
+from tint_sumo.jobs.status import Title
 from tint_sumo.study.folders import DATASET, trait_folder
-from tint_sumo.study.trait_models import evaluate_traits, plot_traits, train_traits
+from tint_sumo.traits.datasets import evaluate_traits, plot_traits, train_traits
 from tint_sumo.traits.storage import add_to_card
 
 SEED = 0  # seed of the dataset and of the trait models

@@ -14,9 +14,9 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
 from tint_sumo.config import Fraction, WindowCount
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.ranges import Range
 from tint_sumo.dataset.windows import Windows, split_by_episode
-from tint_sumo.errors import InputError
-from tint_sumo.ranges import Range
 from tint_sumo.traits.batches import TrainingWindows
 from tint_sumo.traits.model import TraitModel
 

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, NO_LEADER_GAP_M, STEP_S, WINDOW_STEPS, VehicleShape
+from tint_sumo.core.files import whole_file
 from tint_sumo.dataset.windows import Windows
-from tint_sumo.files import whole_file
 from tint_sumo.traits.evaluation import encode_windows
 from tint_sumo.traits.model import TraitModel
 from tint_sumo.traits.vae import Vae

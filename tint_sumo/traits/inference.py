@@ -8,10 +8,10 @@ import torch
 from numpy.typing import NDArray
 
 from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, STEP_S, VehicleShape
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import require_output_file, whole_file
 from tint_sumo.dataset.tracks import read_tracks
 from tint_sumo.dataset.windows import cut_windows, steps_in_window
-from tint_sumo.errors import InputError
-from tint_sumo.files import require_output_file, whole_file
 from tint_sumo.traits.cross_window import CrossWindow, fuse
 from tint_sumo.traits.evaluation import Latents, encode_windows
 from tint_sumo.traits.input_range import InputRange

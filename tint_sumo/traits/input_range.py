@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.config import WINDOW_STEPS
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.structures import FieldError, build
 from tint_sumo.dataset.windows import Windows
-from tint_sumo.errors import InputError
-from tint_sumo.structures import FieldError, build
 
 MARGIN_M = 0.1  # positions with two decimals, as SUMO writes them, are no other input
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from tint_sumo.config import LATENT_SIZE, TraitSettings
-from tint_sumo.errors import find_named, refuse_old_name
+from tint_sumo.core.errors import find_named, refuse_old_name
 from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import WindowEncoder
 

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from tint_sumo.config import LatentCount, TraitSettings
-from tint_sumo.determinism import preserved_random_state
-from tint_sumo.errors import InputError, refuse_old_name
-from tint_sumo.files import read_json, shipped, write_json
-from tint_sumo.ranges import Range
-from tint_sumo.structures import FieldError, build
+from tint_sumo.core.determinism import preserved_random_state
+from tint_sumo.core.errors import InputError, refuse_old_name
+from tint_sumo.core.files import read_json, shipped, write_json
+from tint_sumo.core.ranges import Range
+from tint_sumo.core.structures import FieldError, build
+from tint_sumo.core.weights import read_weights, write_weights
 from tint_sumo.traits.model import TRAIT_METHODS, TraitModel
-from tint_sumo.weights import read_weights, write_weights
 
 RUN_MODEL = "model"  # name of the model in the folder of a training run
 

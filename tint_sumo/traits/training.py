@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from tint_sumo.checkpoints import (
+from tint_sumo.config import LATENT_SIZE, TraitSettings
+from tint_sumo.core.checkpoints import (
     damage_reported,
     pack,
     read_checkpoint,
@@ -22,15 +23,14 @@ from tint_sumo.checkpoints import (
     training_tensors,
     write_checkpoint,
 )
-from tint_sumo.config import LATENT_SIZE, TraitSettings
+from tint_sumo.core.determinism import preserved_random_state, single_threaded
+from tint_sumo.core.errors import DivergedError, InputError
+from tint_sumo.core.files import claim_folder
+from tint_sumo.core.progress import Progress, Report, silent
+from tint_sumo.core.ranges import Range
+from tint_sumo.core.training_log import open_log
 from tint_sumo.dataset.window_file import WindowFile
 from tint_sumo.dataset.windows import Windows
-from tint_sumo.determinism import preserved_random_state, single_threaded
-from tint_sumo.errors import DivergedError, InputError
-from tint_sumo.files import claim_folder
-from tint_sumo.progress import Progress, Report, silent
-from tint_sumo.ranges import Range
-from tint_sumo.training_log import open_log
 from tint_sumo.traits.batches import TrainingWindows, WindowBatch
 from tint_sumo.traits.input_range import InputRange
 from tint_sumo.traits.model import TraitModel, find_trait_method

@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 
 from tint_sumo.config import ends
-from tint_sumo.percentages import percent
-from tint_sumo.study.methods import METHODS, Look, look_of
-from tint_sumo.study.policy_jobs import smoothed_percent
-from tint_sumo.study.rows import WORLDS, Summary, by_title, varied
+from tint_sumo.core.percentages import percent
+from tint_sumo.methods.registry import METHODS, Look, look_of
+from tint_sumo.study.jobs import smoothed_percent
+from tint_sumo.study.summary import WORLDS, Summary, by_title, varied
 from tint_sumo.study.tables import Lines
 
 # Plotly's names for Matplotlib's markers and line styles.

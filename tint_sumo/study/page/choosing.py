@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from tint_sumo.config import Share
+from tint_sumo.methods.evaluation import Evaluation
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.evaluation import Evaluation
-from tint_sumo.study.policy_jobs import label
-from tint_sumo.study.rows import Row, at_mixes, by_title, over_all_mixes
+from tint_sumo.study.jobs import label
+from tint_sumo.study.summary import Row, at_mixes, by_title, over_all_mixes
 
 FAILURES = ("collision", "timeout")
 MOST_CASES = 14

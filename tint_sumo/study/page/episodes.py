@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from tint_sumo.config import share_words
-from tint_sumo.errors import InputError
-from tint_sumo.executors import Workers
+from tint_sumo.core.errors import InputError
+from tint_sumo.jobs import Workers
+from tint_sumo.methods.evaluation import Case
+from tint_sumo.methods.registry import METHODS, look_of
 from tint_sumo.scenes import Scene
-from tint_sumo.study.evaluation import Case
-from tint_sumo.study.methods import METHODS, look_of
 from tint_sumo.study.page.choosing import FAILURES, Choice, Shown
 from tint_sumo.study.page.html import bullets, folded, json_data, packed, paragraph
 from tint_sumo.study.page.recording import MISSING, UNITS, Recording, read_episodes, record_all

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 from tint_sumo.config import share_words
-from tint_sumo.percentages import percent
+from tint_sumo.core.percentages import percent
+from tint_sumo.methods.registry import METHODS, Learned
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.methods import METHODS, Learned
-from tint_sumo.study.rows import Summary, at_mixes, by_title, over_all_mixes
+from tint_sumo.study.summary import Summary, at_mixes, by_title, over_all_mixes
 
 MEANING_OF_P = (
     "P is P(conservative): the probability that a driver is conservative, and yields when the ego moves in front of "

@@ -10,7 +10,7 @@ from tint_sumo import traits
 from tint_sumo.config import LATENT_SIZE, NO_LEADER_GAP_M, POPULATIONS, STEP_S
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows
-from tint_sumo.study.methods import METHODS, Learned
+from tint_sumo.methods.registry import METHODS, Learned
 from tint_sumo.study.page.recording import EPISODES
 from tint_sumo.traits.evaluation import encode_windows
 

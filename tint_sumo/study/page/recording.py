@@ -13,24 +13,24 @@ from numpy.typing import NDArray
 
 import tint_sumo
 from tint_sumo.config import Share
+from tint_sumo.core.files import damaged, read_json, write_text
+from tint_sumo.core.progress import Progress, Report, part_of
+from tint_sumo.core.ranges import Range
+from tint_sumo.core.reading import RESULT_BYTES
+from tint_sumo.core.structures import FieldError, build
 from tint_sumo.envs.rows import Outcome
-from tint_sumo.executors import Workers, executor_of
-from tint_sumo.executors.jobs import THREADS_PER_JOB
-from tint_sumo.files import damaged, read_json, write_text
+from tint_sumo.films.driving import Moment, drive_case
+from tint_sumo.films.trait_probe import TraitReader, fit_reader
+from tint_sumo.jobs import Workers, executor_of
+from tint_sumo.jobs.jobs import THREADS_PER_JOB
+from tint_sumo.jobs.status import Title
+from tint_sumo.methods.evaluation import CASES, CASES_PER_SEED
+from tint_sumo.methods.loading import Contender, find_policy, load_policy
+from tint_sumo.methods.registry import METHODS, Rule
 from tint_sumo.policy.storage import read_policy_card, weights_file
-from tint_sumo.progress import Progress, Report, part_of
-from tint_sumo.ranges import Range
-from tint_sumo.reading import RESULT_BYTES
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
-from tint_sumo.standings import Title
-from tint_sumo.structures import FieldError, build
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.driving import Moment, drive_case
-from tint_sumo.study.evaluation import CASES, CASES_PER_SEED
-from tint_sumo.study.loading import Contender, find_policy, load_policy
-from tint_sumo.study.methods import METHODS, Rule
-from tint_sumo.study.policy_jobs import label, policy_folder, policy_path
-from tint_sumo.study.trait_reader import TraitReader, fit_reader
+from tint_sumo.study.jobs import label, policy_folder, policy_path
 
 EPISODES = "episodes"  # folder of the recorded episodes in a study's folder
 FORMAT = 1  # number of the files' format

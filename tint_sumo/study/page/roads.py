@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import shapely
 
+from tint_sumo.films.frames import HALO_M, LEAST_WEIGHT
 from tint_sumo.scenes import Scene, find_scene
 from tint_sumo.scenes.geometry import SPACING_M, Floats, as_line
 from tint_sumo.scenes.layout import layout
-from tint_sumo.study.drawing import HALO_M, LEAST_WEIGHT
 
 _TOLERANCE_M = 0.02
 

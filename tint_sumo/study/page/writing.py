@@ -13,22 +13,22 @@ from typing import Any
 from plotly.offline import get_plotlyjs
 
 import tint_sumo
-from tint_sumo.errors import InputError
-from tint_sumo.executors import Workers
-from tint_sumo.files import RUN_FILE, damaged, read_json, write_text
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import RUN_FILE, damaged, read_json, write_text
+from tint_sumo.jobs import Workers
+from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import read_versions
 from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION, OwnScene, Scene, read_described
+from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.page.charts import Chart, curve_chart, outcome_chart, world_charts
 from tint_sumo.study.page.choosing import choose
 from tint_sumo.study.page.episodes import Recordings, failure_lists, player_data, player_notes, record_episodes
 from tint_sumo.study.page.findings import MEANING_OF_P, what_came_out
 from tint_sumo.study.page.html import chart, content_policy, folded, json_data, packed, paragraph, section, table
 from tint_sumo.study.page.latents import read_latents
-from tint_sumo.study.policy_jobs import read_curves
 from tint_sumo.study.report import StudyReport
-from tint_sumo.study.rows import Row, at_mixes, over_all_mixes
+from tint_sumo.study.summary import Row, at_mixes, over_all_mixes
 from tint_sumo.study.tables import Lines, Table
-from tint_sumo.study.training import POLICY
 
 PAGE_FILE = "report.html"
 _STATIC = Path(__file__).with_name("static")

@@ -1,0 +1,189 @@
+"""Environments of a SUMO configuration of one's own, and coming back to where an episode was."""
+
+import pickle
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+from tests.envs.test_workers import assert_infos_equal
+from tests.scenes.networks import OWN_NETWORKS, OwnNetwork
+from tint_sumo import SCENE_ENV_ID
+from tint_sumo.core.errors import InputError
+from tint_sumo.envs.sb3 import SceneVecEnv
+from tint_sumo.envs.scene_env import SceneEnv
+from tint_sumo.envs.vector import SceneVectorEnv
+from tint_sumo.scenes import T_INTERSECTION
+
+Make = Callable[[str], OwnNetwork]
+STEPS = 100
+
+
+@contextmanager
+def made(*args: Any, **settings: Any) -> Iterator[SceneEnv]:
+    env = SceneEnv(*args, **settings)
+    try:
+        yield env
+    finally:
+        env.close()
+
+
+def told(answer: tuple[Any, ...]) -> list[Any]:
+    """Everything an environment tells, as things that can be compared."""
+    observation, *rest = answer
+    info = rest.pop()
+    terms = info.pop("reward_terms", {})
+    return [*(one.tolist() for one in observation.values()), *rest, terms, {k: str(v) for k, v in info.items()}]
+
+
+def play(env: SceneEnv, seed: int, steps: int = STEPS) -> list[Any]:
+    """Random actions without a look at the end, so that all plays are equally long."""
+    actions = np.random.default_rng(seed).integers(3, size=steps)
+    return [told(env.step(action)) for action in actions]
+
+
+@pytest.mark.parametrize("name", OWN_NETWORKS)
+def test_gymnasium_makes_and_checks_them(name: str, own_network: Make) -> None:
+    scene = own_network(name).scene(warm_up_s=5.0)
+    env = gymnasium.make(SCENE_ENV_ID, scene=scene, render_mode="rgb_array", tracks=True)
+    try:
+        check_env(env.unwrapped, skip_render_check=True)
+        check_env_sb3(env.unwrapped)
+        observation, info = env.reset(seed=1)
+        np.testing.assert_allclose(observation["ego"], 0.0, atol=1e-6)
+        image = env.render()
+        assert isinstance(image, np.ndarray)
+        assert image.shape == (490, 736, 3)
+        present = observation["mask"] > 0.5
+        np.testing.assert_array_equal(info["traits"] >= 0, present)
+        assert (info["traits"] < len(scene.vtypes)).all()
+        assert (info["position_m"][~present] == 0.0).all()
+        assert not info["passed"].any()
+    finally:
+        env.close()
+
+
+def test_the_traits_are_the_numbers_of_the_vtypes(own_network: Make) -> None:
+    with made(own_network("merge").scene(), time_limit_s=20.0) as env:
+        seen = {int(trait) for trait in env.reset(seed=1)[1]["traits"]}
+        for _ in range(199):
+            observation, _, terminated, truncated, info = env.step(0)
+            seen |= {int(trait) for trait in info["traits"]}
+            assert env.observation_space.contains(observation)
+            if terminated:
+                break
+        else:
+            assert not truncated
+            assert env.step(0)[3]
+            assert env.snapshot().actions == (0,) * 200
+    assert seen == {-1, 0, 1}
+
+
+def test_a_vector_has_as_many_workers_as_environments(own_network: Make) -> None:
+    scene = own_network("merge").scene(warm_up_s=5.0)
+    with pytest.raises(InputError, match="set workers to num_envs"):
+        SceneVectorEnv(2, scene)
+    with pytest.raises(InputError, match="set workers to num_envs"):
+        SceneVectorEnv(3, scene, workers=2)
+    rng = np.random.default_rng(0)
+    vector = SceneVectorEnv(2, scene, workers=2)
+    try:
+        first, _ = vector.reset(seed=5)
+        actions = rng.integers(3, size=(20, 2))
+        rewards = [vector.step(both)[1] for both in actions]
+    finally:
+        vector.close()
+    for index in range(2):
+        with made(scene) as env:
+            observation, _ = env.reset(seed=5 + index)
+            np.testing.assert_array_equal(observation["vehicles"], first["vehicles"][index])
+            for action, reward in zip(actions[:, index], rewards, strict=True):
+                assert env.step(action)[1] == reward[index]
+
+
+def test_stable_baselines_has_them_too(own_network: Make) -> None:
+    env = SceneVecEnv(1, seed=3, scene=own_network("merge").scene(warm_up_s=5.0), tracks=True)
+    try:
+        env.reset()
+        for _ in range(20):
+            env.step(np.array([2]))
+        assert set(env.slots) == {"traits", "position_m", "gap_m", "passed"}
+        env.env_method("park", indices=[0])
+        env.step(np.array([2]))
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("settings", [{"p_conservative": 0.5}, {"tau_s": 1.5}])
+def test_nobody_but_the_configuration_says_who_drives(settings: dict[str, float], own_network: Make) -> None:
+    with pytest.raises(InputError, match="leave p_conservative and tau_s out"):
+        SceneEnv(own_network("merge").scene(), **settings)
+
+
+@pytest.mark.parametrize("name", [*OWN_NETWORKS, T_INTERSECTION])
+def test_an_episode_goes_on_from_a_snapshot_as_it_did(name: str, own_network: Make) -> None:
+    scene: Any = name if name == T_INTERSECTION else own_network(name).scene(warm_up_s=5.0)
+    with made(scene, position_noise_m=0.1, tracks=True, time_limit_s=500.0) as env:
+        env.reset(seed=1)
+        play(env, 0, 10)
+        here = env.step(1)
+        snapshot = pickle.loads(pickle.dumps(env.snapshot()))
+        went_on = play(env, 1)
+        drawn = env.np_random.integers(1000)
+        env.reset(seed=2)
+        play(env, 2, 5)
+        observation, info = env.restore(snapshot)
+        assert told((observation, info))[:3] == told(here)[:3]
+        assert play(env, 1) == went_on
+        assert env.np_random.integers(1000) == drawn
+        with made(scene, position_noise_m=0.1, tracks=True, time_limit_s=500.0, backend="traci") as other:
+            other.restore(snapshot)
+            assert play(other, 1) == went_on
+
+
+@pytest.mark.parametrize("kind", ["one process", "workers", "scenes", "own network"])
+def test_the_episodes_of_a_vector_go_on_from_a_snapshot_as_they_did(kind: str, own_network: Make) -> None:
+    task: dict[str, Any] = {"position_noise_m": 0.1, "tracks": True, "time_limit_s": 12.0}
+    if kind == "own network":
+        task |= {"scene": [own_network("merge").scene(warm_up_s=5.0)] * 2}
+    task |= {
+        "workers": {"workers": 2, "autoreset_mode": "SameStep"},
+        "scenes": {"scene": ["roundabout", T_INTERSECTION]},
+    }.get(kind, {})
+    actions = np.random.default_rng(0).integers(3, size=(300, 4))
+    with closing(SceneVectorEnv(4 if kind != "own network" else 2, **task)) as vector:
+        count = vector.num_envs
+        vector.reset(seed=1)
+        for action in actions[:50]:
+            vector.step(action[:count])
+        vector.reset(options={"reset_mask": np.arange(count) == 0})
+        for action in actions[50:159]:
+            vector.step(action[:count])
+        here = vector.step(actions[159, :count])
+        snapshots = pickle.loads(pickle.dumps(vector.snapshot()))
+        went_on = [vector.step(action[:count]) for action in actions[160:]]
+    assert len({len(one.actions) for one in snapshots}) > 1, "the episodes began at different times"
+    with closing(SceneVectorEnv(count, **task)) as other:
+        observation, _ = other.restore(snapshots)
+        assert_infos_equal(observation, here[0])
+        goes_on = [other.step(action[:count]) for action in actions[160:]]
+    for before, after in zip(went_on, goes_on, strict=True):
+        for first, second in zip(before, after, strict=True):
+            assert_infos_equal(first, second)
+    assert any((one[2] | one[3]).any() for one in went_on)
+
+
+def test_there_is_nothing_to_come_back_to_before_the_first_reset() -> None:
+    with made() as env, pytest.raises(InputError, match="reset the environment first"):
+        env.snapshot()
+    with closing(SceneVectorEnv(2)) as vector:
+        with pytest.raises(InputError, match="reset the environment first"):
+            vector.snapshot()
+        vector.reset(seed=0)
+        with pytest.raises(InputError, match="1 snapshots do not fit 2 environments"):
+            vector.restore(vector.snapshot()[:1])

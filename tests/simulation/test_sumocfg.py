@@ -1,0 +1,248 @@
+"""The simulation of a SUMO configuration of one's own."""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from shapely.affinity import rotate, translate
+
+from tests.scenes.networks import OWN_NETWORKS, OwnNetwork, write_config
+from tint_sumo.config import Backend, EgoController
+from tint_sumo.core.errors import InputError
+from tint_sumo.scenes import OwnScene
+from tint_sumo.simulation.sumocfg import EGO, OwnSimulation, make_simulation
+
+Make = Callable[[str], OwnNetwork]
+
+
+@contextmanager
+def begun(scene: OwnScene, seed: int = 1, backend: Backend = "auto") -> Iterator[OwnSimulation]:
+    simulation = OwnSimulation(scene, backend)
+    try:
+        simulation.reset(0, seed)
+        yield simulation
+    finally:
+        simulation.close()
+
+
+def drive(simulation: OwnSimulation, steps: int, desired_mps: float | None = None) -> Iterator[int]:
+    """Steps at the top speed, or another, until the ego has arrived or had a collision."""
+    scene = simulation.scene
+    desired = np.array([scene.controller.desired_speeds_mps[-1] if desired_mps is None else desired_mps])
+    for step in range(steps):
+        simulation.step(desired)
+        yield step
+        if simulation.egos.front_m[0] > scene.goal_m or simulation.egos.collided[0]:
+            return
+
+
+def test_the_ego_reaches_its_goal_in_every_network(own_network: Make) -> None:
+    for name in OWN_NETWORKS:
+        scene = own_network(name).scene()
+        front_m = []
+        with begun(scene, seed=4) as simulation:
+            egos = simulation.egos
+            assert egos.front_m[0] == scene.start_m
+            assert egos.speed_mps[0] == 0.0
+            assert abs(egos.pose["x_m"][0]) + abs(egos.pose["y_m"][0]) < 1e-9
+            for _ in drive(simulation, round(120.0 / scene.step_s)):
+                front_m.append(egos.front_m[0])
+            assert egos.collided[0] or egos.front_m[0] > scene.goal_m, name
+            assert (np.diff(front_m) >= 0.0).all()
+            assert np.hypot(egos.pose["heading_x"], egos.pose["heading_y"])[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", ["braunschweig", "merge"])
+def test_slots_hold_the_nearest_vehicles_and_rest_between_two(name: str, own_network: Make) -> None:
+    sight_m = {"braunschweig": 60.0, "merge": 30.0}[name]
+    scene = own_network(name).scene(max_vehicles=3, sight_m=sight_m)
+    with begun(scene) as simulation:
+        slots, vehicle = simulation.slots, simulation.connection.vehicle
+        before = slots.vehicle_number[0].copy()
+        crowds = 0
+        for _ in drive(simulation, 400):
+            ego_m = vehicle.getPosition(EGO)
+            away_m = {one: math.dist(ego_m, vehicle.getPosition(one)) for one in vehicle.getIDList() if one != EGO}
+            inside = sorted((one for one in away_m if away_m[one] <= sight_m), key=lambda one: away_m[one])
+            crowds += len(inside) > 3
+            assert set(slots.slot) <= set(inside[:3])
+            numbers = slots.vehicle_number[0].copy()
+            changed = numbers != before
+            assert ((before[changed] == -1) | (numbers[changed] == -1)).all()
+            np.testing.assert_array_equal(slots.present[0], numbers >= 0)
+            np.testing.assert_array_equal(slots.member[0] >= 0, slots.present[0])
+            for one, slot in slots.slot.items():
+                assert scene.vtypes[slots.member[0, slot]] == vehicle.getTypeID(one)
+                assert slots.width_m[0, slot] == vehicle.getWidth(one)
+            before = numbers
+        assert crowds > 10
+
+
+def test_distances_are_those_of_boxes_of_each_vehicles_size(own_network: Make) -> None:
+    scene = own_network("braunschweig").scene()
+    with begun(scene) as simulation:
+        slots, egos = simulation.slots, simulation.egos
+        seen = set()
+        for step in drive(simulation, 300):
+            if step % 30 == 0:
+                ego = _box(egos.pose[0], 5.0, 2.0)
+                for slot in np.flatnonzero(slots.present[0]).tolist():
+                    size_m = float(slots.length_m[0, slot]), float(slots.width_m[0, slot])
+                    seen.add(size_m)
+                    other = _box(slots.pose[0, slot], *size_m)
+                    assert egos.distance_m[0, slot] == pytest.approx(ego.distance(other), abs=1e-6)
+        assert len(seen) > 1
+
+
+def _box(pose: np.void, length_m: float, width_m: float) -> shapely.Polygon:
+    box = shapely.box(-length_m / 2, -width_m / 2, length_m / 2, width_m / 2)
+    angle_rad = math.atan2(pose["heading_y"], pose["heading_x"])
+    return translate(rotate(box, angle_rad, origin=(0, 0), use_radians=True), pose["x_m"], pose["y_m"])
+
+
+def test_touching_a_vehicle_is_a_collision_with_its_vtype(own_network: Make) -> None:
+    blind = EgoController(unsafe_distance_m=0.0, closing_distance_m=0.0)
+    scene = _with_standing_vehicle(own_network("merge"), 50.0).scene(controller=blind)
+    with begun(scene) as simulation:
+        for _ in drive(simulation, 200):
+            pass
+        collision, egos = simulation.egos.collision[0], simulation.egos
+        assert collision is not None
+        assert (scene.vtypes[collision.member], collision.route) == ("van", "ramp")
+        assert egos.distance_m[0, collision.slot] == 0.0
+        assert 50.0 - 7.0 < egos.front_m[0] < 50.0 - 7.0 + 0.3 + 1e-6  # the van's back is at 43 m
+
+
+def test_the_safety_check_holds_the_ego_behind_a_standing_vehicle(own_network: Make) -> None:
+    scene = _with_standing_vehicle(own_network("merge"), 50.0).scene()
+    with begun(scene) as simulation:
+        for _ in drive(simulation, 200):
+            pass
+        assert 42.0 < simulation.egos.front_m[0] < 43.0
+        assert not simulation.egos.collided[0]
+
+
+def _with_standing_vehicle(network: OwnNetwork, front_m: float) -> OwnNetwork:
+    """The same without other traffic, and with a van on the ramp."""
+    folder = network.sumocfg.parent
+    (folder / "standing.rou.xml").write_text(
+        '<routes><vType id="van" length="7"/>'
+        f'<vehicle id="standing" type="van" depart="0" departPos="{front_m}"><route edges="ramp out"/>'
+        f'<stop lane="ramp_0" endPos="{front_m}" duration="1000"/></vehicle></routes>'
+    )
+    step = '<step-length value="0.1"/>'
+    return replace(
+        network, sumocfg=write_config(folder / "standing.sumocfg", "merge.net.xml", "standing.rou.xml", step)
+    )
+
+
+def test_an_episode_depends_on_its_seed_alone_whatever_the_backend(own_network: Make) -> None:
+    scene = own_network("merge").scene()
+
+    def lived(simulation: OwnSimulation, seed: int) -> list[bytes]:
+        simulation.reset(0, seed)
+        slots, egos = simulation.slots, simulation.egos
+        return [
+            slots.pose[slots.present].tobytes() + egos.pose.tobytes() + simulation.leaders()[1].tobytes()
+            for _ in drive(simulation, 150)
+        ]
+
+    first, second = OwnSimulation(scene), OwnSimulation(scene)
+    try:
+        assert (first.backend, second.backend) == ("libsumo", "traci")
+        once = lived(first, 1)
+        assert lived(first, 2) != once
+        assert lived(first, 1) == once
+        assert lived(second, 1) == once
+    finally:
+        first.close()
+        second.close()
+
+
+def test_leaders_are_seen_with_gaps_from_bumper_to_bumper(own_network: Make) -> None:
+    scene = own_network("merge").scene(sight_m=100.0)
+    seen = 0
+    with begun(scene) as simulation:
+        slots = simulation.slots
+        for _ in drive(simulation, 200, desired_mps=0.0):
+            leader, gap_m = simulation.leaders()
+            for slot in np.flatnonzero(leader[0] >= 0).tolist():
+                own, ahead = slots.pose[0, slot], slots.pose[0, leader[0, slot]]
+                straight = own["heading_x"] > 0.999 and ahead["heading_x"] > 0.999
+                if straight and abs(own["y_m"] - ahead["y_m"]) < 0.1:
+                    assert gap_m[0, slot] == pytest.approx(ahead["x_m"] - own["x_m"] - 5.0, abs=0.2)
+                    seen += 1
+    assert seen > 20
+
+
+def test_a_cleared_simulation_stands_still(own_network: Make) -> None:
+    with begun(own_network("merge").scene()) as simulation:
+        simulation.clear(0)
+        time_s = simulation.connection.simulation.getTime()
+        simulation.step(np.array([3.0]))
+        assert simulation.connection.simulation.getTime() == time_s
+        assert not simulation.slots.present.any()
+
+
+def test_the_end_of_the_route_is_past_the_goal(own_network: Make) -> None:
+    network = own_network("merge")
+    end_m = network.scene().route_edge_start_m[1] + 145.0
+    scene = network.scene(start_m=end_m - 20.0, goal_m=end_m - 0.01)
+    with begun(scene) as simulation:
+        for _ in drive(simulation, 200):
+            pass
+        assert simulation.egos.collided[0] or simulation.egos.front_m[0] > scene.goal_m
+
+
+def test_vehicles_where_the_ego_starts_are_told(own_network: Make) -> None:
+    scene = _with_standing_vehicle(own_network("merge"), 22.0).scene()
+    with pytest.raises(InputError, match=r"no room at its start \(20 m\)"), begun(scene):
+        pass
+
+
+def test_demand_that_sumo_refuses_is_told_in_one_line(own_network: Make) -> None:
+    network = own_network("merge")
+    folder = network.sumocfg.parent
+    (folder / "wrong.rou.xml").write_text(
+        '<routes><vehicle id="wrong" depart="0"><route edges="nowhere"/></vehicle></routes>'
+    )
+    sumocfg = write_config(folder / "wrong.sumocfg", "merge.net.xml", "wrong.rou.xml")
+    scene = OwnNetwork(sumocfg, network.ego_route, 20.0, 100.0).scene()
+    for backend in ("libsumo", "traci"):
+        with pytest.raises(InputError, match=r"SUMO does not run .*wrong\.sumocfg") as caught:
+            OwnSimulation(scene, backend)
+        assert "\n" not in str(caught.value)
+
+
+def test_what_the_configuration_writes_is_left_unwritten(own_network: Make) -> None:
+    network = own_network("merge")
+    folder = network.sumocfg.parent
+    more = '<output><tripinfo-output value="trips.xml"/><fcd-output value="fcd.xml"/></output>'
+    sumocfg = write_config(folder / "writing.sumocfg", "merge.net.xml", "merge.rou.xml", more)
+    with begun(OwnNetwork(sumocfg, network.ego_route, 20.0, 100.0).scene()) as simulation:
+        simulation.step(np.array([3.0]))
+    assert not (folder / "trips.xml").exists()
+    assert not (folder / "fcd.xml").exists()
+
+
+def test_there_is_one_simulation_per_process(own_network: Make) -> None:
+    with pytest.raises(InputError, match="set workers to num_envs"):
+        make_simulation(2, own_network("merge").scene())
+
+
+@pytest.mark.parametrize("backend", ["libsumo", "traci"])
+def test_an_ego_that_sumo_teleports_is_told(backend: Backend, own_network: Make) -> None:
+    network = _with_standing_vehicle(own_network("merge"), 90.0)
+    text = network.sumocfg.read_text().replace("</configuration>", '<time-to-teleport value="5"/></configuration>')
+    impatient = network.sumocfg.with_name("impatient.sumocfg")
+    impatient.write_text(text)
+    with (
+        begun(replace(network, sumocfg=impatient).scene(), backend=backend) as simulation,
+        pytest.raises(InputError, match=r'SUMO teleports the ego at .* set time-to-teleport to "-1"'),
+    ):
+        for _ in drive(simulation, 100, desired_mps=0.0):
+            pass

@@ -1,0 +1,98 @@
+"""Reading of files that others may have written: only regular files up to a size that suits their kind are opened.
+
+Pipes and devices would keep a command waiting, or never end.
+"""
+
+import gzip
+import os
+import stat
+import zlib
+from pathlib import Path
+from typing import IO
+
+from tint_sumo.core.errors import InputError
+
+SETTINGS_BYTES = 2**17  # of configuration files: one with all settings of a command has some 2**13
+JSON_BYTES = 2**24  # of cards, manifests and settings of runs
+RESULT_BYTES = 2**28  # of results, and of episodes that were recorded for a report
+WEIGHTS_BYTES = 2**30  # of the weights of one network
+TABLE_BYTES = 2**36  # of trajectories, networks and demand
+MOST_RATIO = 200  # of a gzipped file's content to its size; gzip can reach 1032, SUMO's files do not come near it
+_SMALL_BYTES = 2**25  # content that may have any ratio
+_CHUNK_BYTES = 2**20
+
+
+def open_file(path: Path, what: str, most_bytes: int) -> IO[bytes]:
+    """Open a file for reading.
+
+    Args:
+        path: of the file.
+        what: its role, for messages.
+        most_bytes: a larger file is refused.
+
+    Raises:
+        InputError: there is no such file, it cannot be read, is none of the regular files, or is too large.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe alone could keep it waiting
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{what}: no file {path}; check the path") from None
+    except (OSError, ValueError) as error:  # no permission; a path with a null byte
+        raise InputError(f"{what}: {str(path)!r} cannot be read ({error}); check the path") from None
+    found = os.fstat(descriptor)
+    if not stat.S_ISREG(found.st_mode):
+        problem = "is a folder, a pipe or a device; give a regular file"
+    elif found.st_size > most_bytes:
+        problem = f"has {found.st_size:,} bytes, more than the {most_bytes:,} that are read; check the path"
+    else:
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    raise InputError(f"{what}: {path} {problem}")
+
+
+def require_file(path: Path, what: str, most_bytes: int) -> None:
+    """Check a file, gzipped or not, for libraries that open it by its path.
+
+    Raises:
+        InputError: as in ``open_file``; or the file is gzipped, and unpacks to too much.
+    """
+    with open_file(path, what, most_bytes) as file:
+        if is_gzipped(file) and not _unpacks_within(file, most_bytes):
+            raise InputError(
+                f"{what}: {path} unpacks to more than {most_bytes:,} bytes or {MOST_RATIO} times its size, "
+                "as no such file does; check the path"
+            )
+
+
+def is_gzipped(file: IO[bytes]) -> bool:
+    """Whether a file that was just opened is gzipped; it is read from its beginning again."""
+    magic = file.read(2)
+    file.seek(0)
+    return magic == b"\x1f\x8b"
+
+
+def _unpacks_within(file: IO[bytes], most_bytes: int) -> bool:
+    """Whether a gzipped file has no more bytes than allowed; a damaged one is left to its reader, which says so."""
+    unpacked = 0
+    with gzip.GzipFile(fileobj=file) as stream:
+        try:
+            while chunk := stream.read(_CHUNK_BYTES):
+                unpacked += len(chunk)
+                if unpacked > min(most_bytes, max(_SMALL_BYTES, MOST_RATIO * file.tell())):
+                    return False
+        except (EOFError, OSError, zlib.error):
+            pass
+    return True
+
+
+def read_file(path: Path, what: str, most_bytes: int) -> bytes:
+    """Return all bytes of a file.
+
+    Raises:
+        InputError: as in ``open_file``.
+    """
+    try:
+        with open_file(path, what, most_bytes) as file:
+            return file.read(most_bytes)
+    except OSError as error:
+        raise InputError(f"{what}: {path} cannot be read ({error}); check the path") from None

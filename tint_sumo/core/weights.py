@@ -1,0 +1,84 @@
+"""Weights of networks as safetensors files, which cannot hold code; their sizes are known before they are read."""
+
+import hashlib
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import read_json, write_bytes, write_json
+from tint_sumo.core.reading import WEIGHTS_BYTES, read_file, require_file
+
+SHA256 = "weights_sha256"  # a card's entry with the checksum of the weights beside it
+_TYPES = {"F32": torch.float32, "F64": torch.float64, "I64": torch.int64, "BOOL": torch.bool}
+
+
+def write_weights(file: Path, weights: Mapping[str, Tensor]) -> dict[str, str]:
+    """Write the weights; what the card says about the file."""
+    content = safetensors.torch.save(dict(weights))
+    write_bytes(file, content)
+    return {SHA256: hashlib.sha256(content).hexdigest()}
+
+
+def read_weights(
+    file: Path, card_file: Path, build: Callable[[], nn.Module], card: Mapping[str, Any]
+) -> dict[str, Tensor]:
+    """Return the weights in a file.
+
+    The header of the file is read first, and compared with the network that the card describes, before any memory is
+    taken for that network.
+
+    Args:
+        file: of the weights.
+        card_file: file of the card, for messages.
+        build: makes the network; it is called to look at the sizes of weights alone.
+        card: what the card says; weights without a checksum there are read, and a line on stderr says so.
+
+    Raises:
+        InputError: the file is missing, damaged, not the one that the card describes, or holds a number that is not
+            finite; or ``build`` raises it.
+    """
+    require_file(file, "weights", WEIGHTS_BYTES)
+    with torch.device("meta"):
+        wanted = {name: (tensor.dtype, tuple(tensor.shape)) for name, tensor in build().state_dict().items()}
+    damaged = f"{file} is damaged; restore the file or train the model again"
+    try:
+        with safe_open(file, framework="pt") as header:
+            slices = {name: header.get_slice(name) for name in header.keys()}  # noqa: SIM118 - no mapping
+            found = {name: (_TYPES.get(one.get_dtype()), tuple(one.get_shape())) for name, one in slices.items()}
+    except (OSError, SafetensorError):
+        raise InputError(damaged) from None
+    if any(wanted.get(name) != one for name, one in found.items()):
+        raise InputError(f"{card_file} does not fit the weights beside it; restore both files")
+    content = read_file(file, "weights", WEIGHTS_BYTES)
+    if SHA256 not in card:
+        print(f"{card_file} has no checksum of the weights, which are not verified", file=sys.stderr)
+    elif card[SHA256] != hashlib.sha256(content).hexdigest():
+        raise InputError(f"{file} is damaged: it has another checksum than {card_file.name} says; restore both files")
+    try:
+        weights = safetensors.torch.load(content)
+    except SafetensorError:
+        raise InputError(damaged) from None
+    for name, tensor in weights.items():
+        if not torch.isfinite(tensor).all():
+            raise InputError(
+                f"{file} has numbers that are not finite in {name}; restore the file or train the model again"
+            )
+    return weights
+
+
+def add_checksum(file: Path) -> None:
+    """Write the checksum of weights into the card beside them.
+
+    Raises:
+        InputError: one of the two is missing or damaged.
+    """
+    card = file.with_suffix(".json")
+    digest = hashlib.sha256(read_file(file, "weights", WEIGHTS_BYTES)).hexdigest()
+    write_json(card, {**read_json(card, "card"), SHA256: digest})

@@ -1,0 +1,160 @@
+"""Films and film strips of single cases."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageColor
+
+from tint_sumo.config import Share, share_words
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import require_output_file, whole_file
+from tint_sumo.core.progress import Progress, Report, silent
+from tint_sumo.envs.rendering import RENDER_FPS
+from tint_sumo.films.driving import Moment, drive_case
+from tint_sumo.films.frames import SIZE_PX, Artist
+from tint_sumo.films.trait_probe import fit_reader
+from tint_sumo.methods.evaluation import CASES_PER_SEED, require_seed
+from tint_sumo.methods.loading import Contender
+from tint_sumo.methods.registry import look_of
+from tint_sumo.scenes import OwnScene, Scene, find_scene
+from tint_sumo.scenes.layout import layout
+
+SUFFIXES = (".mp4", ".gif", ".png")
+_STRIP, _GAP_PX = (4, 2), 4  # pictures across and down, and what is between them
+_LAST_S = 1.5  # a film shows its last moment for so long
+
+
+@dataclass(frozen=True)
+class Film:
+    """What a film shows."""
+
+    outcome: str
+    time_s: float
+    frames: int
+
+
+def render_case(
+    contender: Contender,
+    case: int,
+    out: Path,
+    *,
+    seed: int = 0,
+    p_conservative: Share | None = None,
+    report: Report = silent,
+    **task: Any,
+) -> Film:
+    """Drive one unseen case and write what happened: a film, or for .png a strip of its moments.
+
+    A film shows every step of the simulation and runs as fast as the world.
+
+    Args:
+        contender: who drives.
+        case: number of the case, as in ``tint_sumo.methods.evaluation.evaluate``.
+        out: .mp4, .gif or .png file.
+        seed: which set of cases, 0 to 1000.
+        p_conservative: as in ``SceneEnv``; that of the contender if not given.
+        report: told of the progress.
+        task: as in ``SceneEnv``; the scene is the contender's.
+
+    Raises:
+        InputError: there is no such case, or no such kind of film, or what writes it is not installed.
+    """
+    require_film_file(out)
+    require_seed(seed)
+    if not 0 <= case < CASES_PER_SEED:
+        raise InputError(f"case must lie in 0 to {CASES_PER_SEED - 1}, not {case}")
+    share = contender.p_conservative if p_conservative is None else p_conservative
+    played = require_film_scene(contender)
+    moments = list(drive_case(contender, case, seed, p_conservative=share, **task))
+    shown = _spread(moments) if out.suffix.lower() == ".png" else moments
+    parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(share))
+    has_attention = moments[0].attention is not None
+    colour = ImageColor.getrgb(look_of(contender.method).colour)
+    artist = Artist(layout(played), (" " * 5).join(parts), colour, fit_reader(contender), has_attention)
+    with whole_file(out) as partial:
+        _WRITERS[out.suffix.lower()](partial, artist, shown, report)
+    return Film(moments[-1].outcome, round(moments[-1].time_s, 3), len(shown))
+
+
+def require_film_scene(contender: Contender) -> Scene:
+    """The contender's scene; InputError unless a film can show it."""
+    scene = find_scene(contender.scene)
+    if isinstance(scene, OwnScene):
+        raise InputError(f"scene {scene.name} is a SUMO configuration; films show built-in scenes only")
+    count = len(scene.population.profiles)
+    if count != 2:
+        raise InputError(f"a film shows drivers of two profiles, and scene {scene.name} has {count}")
+    return scene
+
+
+def require_film_file(out: Path) -> None:
+    """Raise InputError unless a film can be written there."""
+    require_output_file(out, SUFFIXES)
+    if out.suffix.lower() == ".mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401, PLC0415 - of an extra
+        except ImportError:
+            raise InputError('.mp4 needs: pip install "tint_sumo[video]"; .gif and .png do without') from None
+
+
+def _spread(moments: Sequence[Moment]) -> list[Moment]:
+    """As many as a strip shows, evenly spread, the first and the last among them."""
+    across, down = _STRIP
+    return [moments[index] for index in np.linspace(0, len(moments) - 1, across * down).round().astype(int).tolist()]
+
+
+def _words(share: Share | None) -> str:
+    assert share is not None  # it is None in a SUMO configuration alone
+    return f"P(conservative) {share_words(share)}"
+
+
+def _frames(artist: Artist, moments: Sequence[Moment], report: Report) -> Iterator[Image.Image]:
+    for done, moment in enumerate(moments, start=1):
+        yield artist.frame(moment)
+        report(Progress(done, len(moments), "frame"))
+
+
+def _write_strip(file: Path, artist: Artist, moments: Sequence[Moment], report: Report) -> None:
+    pitch_px = [side + _GAP_PX for side in SIZE_PX]
+    size = [count * pitch - _GAP_PX for count, pitch in zip(_STRIP, pitch_px, strict=True)]
+    strip = Image.new("RGB", (size[0], size[1]))
+    for number, frame in enumerate(_frames(artist, moments, report)):
+        down, across = divmod(number, _STRIP[0])
+        strip.paste(frame, (across * pitch_px[0], down * pitch_px[1]))
+    strip.save(file, format="PNG")
+
+
+def _write_gif(file: Path, artist: Artist, moments: Sequence[Moment], report: Report) -> None:
+    palette = _palette(artist, moments)
+    first, *rest = (
+        frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in _frames(artist, moments, report)
+    )
+    durations_ms = [round(1000 / RENDER_FPS)] * len(rest) + [round(1000 * _LAST_S)]
+    first.save(file, format="GIF", save_all=True, append_images=rest, duration=durations_ms, loop=0)
+
+
+def _palette(artist: Artist, moments: Sequence[Moment]) -> Image.Image:
+    """The colours of the first, a middle and the last moment."""
+    chosen = (moments[0], moments[len(moments) // 2], moments[-1])
+    return Image.fromarray(np.concatenate([np.asarray(artist.frame(moment)) for moment in chosen])).quantize()
+
+
+def _write_mp4(file: Path, artist: Artist, moments: Sequence[Moment], report: Report) -> None:
+    import imageio_ffmpeg  # noqa: PLC0415 - of an extra
+
+    writer = imageio_ffmpeg.write_frames(file, SIZE_PX, fps=RENDER_FPS, output_params=["-f", "mp4"])
+    writer.send(None)
+    try:
+        for frame in _frames(artist, moments, report):
+            pixels = frame.tobytes()
+            writer.send(pixels)
+        for _ in range(round(_LAST_S * RENDER_FPS)):
+            writer.send(pixels)
+    finally:
+        writer.close()
+
+
+_WRITERS = {".mp4": _write_mp4, ".gif": _write_gif, ".png": _write_strip}

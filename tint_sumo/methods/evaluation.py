@@ -1,0 +1,157 @@
+"""Every method meets the same unseen cases."""
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.progress import Progress, Report, silent
+from tint_sumo.core.ranges import Range
+from tint_sumo.core.statistics import Rate
+from tint_sumo.envs.rows import OUTCOMES, Outcome
+from tint_sumo.methods.registry import Policy
+
+# Seed of the first case. Training draws its environments' seeds below this number, so no case is ever trained on.
+CASE_SEED = 1_000_000_000
+CASES_PER_SEED = 1_000_000
+MAX_SEED = 1000
+CASES = 0  # the set of cases that studies report
+TUNING_CASES = 1000  # the set that settings are chosen on, which is reported nowhere
+BATCH = 100  # environments at a time
+_STOP = 0  # action of environments whose case is over
+
+
+@dataclass(frozen=True)
+class Case:
+    """How one episode went."""
+
+    outcome: str  # success, timeout or collision
+    time_s: float  # time of its end
+    trait: str | None = None  # trait of the driver that was hit
+    route: str | None = None  # route of that driver
+
+
+StoredCase = tuple[Outcome, Annotated[float, Range(0.0, 1e6)], str | None, str | None]  # a case in files
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How a policy fared in a number of cases."""
+
+    cases: tuple[Case, ...]
+
+    def rate(self, outcome: str) -> Rate:
+        return Rate(sum(case.outcome == outcome for case in self.cases), len(self.cases))
+
+    @property
+    def navigation_time_s(self) -> float | None:
+        """Mean time of successful episodes; None without any."""
+        times_s = [case.time_s for case in self.cases if case.outcome == "success"]
+        return float(np.mean(times_s)) if times_s else None
+
+    @property
+    def collisions(self) -> dict[str, int]:
+        """Number of collisions by trait and route of the driver that was hit, as ``"aggressive, lower"``."""
+        hits = Counter(f"{case.trait}, {case.route}" for case in self.cases if case.outcome == "collision")
+        return dict(sorted(hits.items()))
+
+    def summary(self) -> dict[str, Any]:
+        """Rates as fractions with 95 % intervals, and what else is worth knowing, ready for JSON."""
+        rates = {outcome: self.rate(outcome) for outcome in OUTCOMES}
+        return {
+            **{outcome: rate.value for outcome, rate in rates.items()},
+            "intervals": {outcome: list(rate.interval) for outcome, rate in rates.items()},
+            "episodes": len(self.cases),
+            "navigation_time_s": self.navigation_time_s,
+            "collisions": self.collisions,
+        }
+
+
+def case_seed(seed: int, number: int = 0) -> int:
+    """Environment seed of case ``number`` of the set of cases ``seed``."""
+    return CASE_SEED + seed * CASES_PER_SEED + number
+
+
+def require_seed(seed: int) -> None:
+    """Raise InputError unless ``seed`` lies in 0 to 1000."""
+    if not 0 <= seed <= MAX_SEED:
+        raise InputError(f"seed must lie in 0 to {MAX_SEED}, not {seed}")
+
+
+def require_cases(episodes: int, seed: int, first: int = 0) -> None:
+    """Raise InputError unless a set of cases has so many, from the case ``first`` on."""
+    require_seed(seed)
+    if not 1 <= episodes <= CASES_PER_SEED - first:
+        raise InputError(f"episodes must lie in 1 to {CASES_PER_SEED}, not {episodes}")
+
+
+def evaluate(
+    policy: Policy,
+    make_venv: Callable[[int], VecEnv],
+    episodes: int,
+    seed: int,
+    *,
+    first: int = 0,
+    batch: int = BATCH,
+    report: Report = silent,
+) -> Evaluation:
+    """Run ``policy`` with its likeliest actions through the cases ``first``, ``first + 1``, ... of the set ``seed``.
+
+    Case i is the first episode of an environment seeded with ``case_seed(seed, i)``, whatever the method and the batch.
+
+    Args:
+        policy: a rule or a Stable-Baselines3 model; recurrent states are carried along.
+        make_venv: makes the vector environment of so many environments; closed at the end.
+        episodes: number of cases.
+        seed: which set of cases, 0 to 1000.
+        first: number of the first case.
+        batch: environments at a time.
+        report: told of the progress.
+
+    Raises:
+        InputError: no episodes, too many, or a seed out of range.
+    """
+    require_cases(episodes, seed, first)
+    cases: dict[int, Case] = {}
+    venv = make_venv(min(batch, episodes))
+    try:
+        for done in range(0, episodes, venv.num_envs):
+            wanted = min(venv.num_envs, episodes - done)
+            for index, case in _first_episodes(policy, venv, case_seed(seed, first + done), wanted):
+                cases[done + index] = case
+                report(Progress(len(cases), episodes, "case", _shares(cases.values())))
+    finally:
+        venv.close()
+    return Evaluation(tuple(cases[number] for number in range(episodes)))
+
+
+def _first_episodes(policy: Policy, venv: VecEnv, first_seed: int, wanted: int) -> Iterator[tuple[int, Case]]:
+    """Index and first episode of each of the first ``wanted`` environments, as they end."""
+    venv.seed(first_seed)
+    observation: Any = venv.reset()
+    state, starts = None, np.ones(venv.num_envs, bool)
+    running = np.arange(venv.num_envs) < wanted
+    while running.any():
+        actions, state = policy.predict(observation, state=state, episode_start=starts, deterministic=True)
+        observation, _, starts, infos = venv.step(np.where(running, actions, _STOP))
+        ended = np.flatnonzero(starts & running).tolist()
+        for index in ended:
+            yield index, _case(infos[index])
+        if ended:
+            running &= ~starts
+            venv.env_method("park", indices=ended)
+
+
+def _shares(cases: Collection[Case]) -> dict[str, float]:
+    """What a report tells of the cases so far."""
+    ends = Counter(case.outcome for case in cases)
+    return {outcome: ends[outcome] / len(cases) for outcome in ("success", "collision")}
+
+
+def _case(info: dict[str, Any]) -> Case:
+    hit = info.get("collision", {})
+    return Case(info["outcome"], round(info["time_s"], 3), hit.get("trait"), hit.get("route"))

@@ -1,0 +1,145 @@
+"""Jobs that evaluate a policy on some of the cases each, so that many machines can share them."""
+
+import math
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import read_record, write_json
+from tint_sumo.core.progress import Report
+from tint_sumo.core.reading import RESULT_BYTES
+from tint_sumo.jobs import Executor
+from tint_sumo.jobs.jobs import THREADS_PER_JOB
+from tint_sumo.jobs.status import Title
+from tint_sumo.methods.evaluation import BATCH, Case, Evaluation, StoredCase, evaluate, require_cases
+from tint_sumo.methods.loading import Contender, load_policy
+from tint_sumo.scenes import AnyScene, OwnScene, find_scene
+
+MAX_CASES = 1000  # cases of a job: some 20 seconds' work is lost with a machine
+_MODEL = "model"  # folder of the policy's files
+_SUFFIXES = (".safetensors", ".json", ".zip")
+
+
+@dataclass(frozen=True)
+class _Cases:
+    """What such a job writes."""
+
+    cases: tuple[StoredCase, ...]
+
+
+@dataclass(frozen=True)
+class CasesJob:
+    """Evaluate a policy on the cases ``first``, ``first + 1``, ... of a set of cases."""
+
+    model: str  # a name, or a path in ``out``
+    scene: AnyScene | None  # as in ``load_policy``
+    allow_pickle: bool
+    world: Mapping[str, Any]  # what the environments are told
+    seed: int  # which set of cases
+    first: int
+    episodes: int
+    out: Path
+
+    needs = ()
+    inputs = (_MODEL,)
+    uses_gpu = False
+
+    @property
+    def name(self) -> str:
+        return f"cases {self.first}"
+
+    @property
+    def title(self) -> Title:
+        return Title(f"cases {self.first} to {self.first + self.episodes - 1}")
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return (f"cases-{self.first}.json",)
+
+    @property
+    def file(self) -> Path:
+        return self.out / self.outputs[0]
+
+    def is_done(self) -> bool:
+        return self.file.exists()
+
+    def run(self, report: Report) -> str:
+        torch.set_num_threads(THREADS_PER_JOB)
+        placed = self.out / self.model
+        contender = load_policy(
+            placed if placed.exists() else self.model, scene=self.scene, allow_pickle=self.allow_pickle
+        )
+        evaluation = evaluate(
+            contender.policy,
+            lambda num_envs: contender.make_venv(num_envs, **self.world),
+            self.episodes,
+            self.seed,
+            first=self.first,
+            report=report,
+        )
+        write_json(self.file, {"cases": [astuple(case) for case in evaluation.cases]})
+        return ""
+
+    def cases(self) -> tuple[Case, ...]:
+        """What came out."""
+        return tuple(Case(*one) for one in read_record(self.file, "cases", _Cases, RESULT_BYTES).cases)
+
+
+def evaluate_on(
+    executor: Executor,
+    model: str,
+    contender: Contender,
+    world: Mapping[str, Any],
+    episodes: int,
+    seed: int,
+    *,
+    scene: AnyScene | None = None,
+    allow_pickle: bool = False,
+    progress: bool = True,
+) -> Evaluation:
+    """``evaluate`` a policy with an executor; case by case, the outcome is the same.
+
+    Args:
+        executor: where it is done.
+        model, scene, allow_pickle: what ``load_policy`` was given.
+        contender: what it has made of that.
+        world: what the environments are told.
+        episodes, seed: number of cases, and which set of cases.
+        progress: show a table on stderr.
+
+    Raises:
+        InputError: bad values, or a scene that other machines do not have.
+        JobError: cases were given up.
+    """
+    require_cases(episodes, seed)
+    if isinstance(find_scene(contender.scene), OwnScene):
+        raise InputError("the .sumocfg of a scene is on this machine alone; use --executor local")
+    with tempfile.TemporaryDirectory(prefix="tint_sumo-") as folder:
+        out = Path(folder)
+        named = _copy_model(model, out)
+        rounds = math.ceil(episodes / (MAX_CASES * executor.slots))  # each gives every slot a job of the same size
+        count = BATCH * math.ceil(episodes / (rounds * executor.slots * BATCH))
+        jobs = [
+            CasesJob(named, scene, allow_pickle, world, seed, first, min(count, episodes - first), out)
+            for first in range(0, episodes, count)
+        ]
+        executor.run(jobs, progress)
+        return Evaluation(tuple(case for job in jobs for case in job.cases()))
+
+
+def _copy_model(model: str, out: Path) -> str:
+    """Copy a policy's files, and those beside it that it may need; how to name it there."""
+    given = Path(model)
+    if not given.exists():
+        return model
+    (out / _MODEL).mkdir()
+    for file in (given if given.is_dir() else given.parent).iterdir():
+        if file.suffix in _SUFFIXES and file.is_file():
+            shutil.copy(file, out / _MODEL)
+    return _MODEL if given.is_dir() else f"{_MODEL}/{given.name}"

@@ -1,0 +1,203 @@
+"""Policies by name or path, ready to be evaluated."""
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.vec_env import VecEnv
+
+from tint_sumo import traits
+from tint_sumo.config import LATENT_SIZE, Share, ends, is_share
+from tint_sumo.core.determinism import preserved_random_state
+from tint_sumo.core.errors import InputError, refuse_old_name
+from tint_sumo.core.files import shipped
+from tint_sumo.methods.registry import METHODS, Learned, Policy, Rule, find_learned
+from tint_sumo.methods.rules import ACTIONS as RULE_ACTIONS
+from tint_sumo.methods.training import POLICY, TRAITS, digest
+from tint_sumo.policy import RecurrentPPO, TraitSource
+from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
+from tint_sumo.policy.venv import policy_venv
+from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnScene, find_scene, read_described
+from tint_sumo.traits import TraitModel
+
+DEFAULT_P_CONSERVATIVE = 0.4
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A policy and the environment it drives in."""
+
+    name: str
+    policy: Policy
+    source: Callable[[], TraitSource] | None = None  # source of the traits in its observations; None: it has no traits
+    p_conservative: Share | None = DEFAULT_P_CONSERVATIVE  # what it was trained for; None in a SUMO configuration
+    action_repeat: int = 1  # simulation steps per decision
+    scene: AnyScene = T_INTERSECTION  # what it was trained in
+    method: str = ""  # name of the method in the registry
+
+    @property
+    def scene_name(self) -> str:
+        return self.scene if isinstance(self.scene, str) else self.scene.name
+
+    @property
+    def tau_s(self) -> float | None:
+        """Time headway of the scene's drivers; None in a SUMO configuration."""
+        scene = find_scene(self.scene)
+        return None if isinstance(scene, OwnScene) else scene.tau_s
+
+    def make_venv(self, num_envs: int, **task: Any) -> VecEnv:
+        """Environments with the observations the policy takes; ``task`` as in ``SceneEnv``.
+
+        In a SUMO configuration each has a process of its own, and there are no more than the machine has cores.
+        """
+        source = None if self.source is None else self.source()
+        place = task.get("scene", self.scene)
+        count = min(num_envs, os.cpu_count() or 1) if isinstance(place, OwnScene) else num_envs
+        return policy_venv(count, source, action_repeat=self.action_repeat, **{"scene": place, **task})
+
+
+def load_policy(name_or_path: str | Path, *, scene: AnyScene | None = None, allow_pickle: bool = False) -> Contender:
+    """A hand-written rule or a shipped policy by its name, or a trained one by its folder or file.
+
+    The card, a .json file beside the weights, tells the method, and where the trait model is.
+
+    Args:
+        name_or_path: name, folder of a training run, .safetensors file, or Stable-Baselines3's .zip file with the
+            card beside it.
+        scene: the scene it shall drive in; if not given the one it was trained in, for rules the paper's.
+        allow_pickle: read .zip files. They can run any code, so allow that only for files you trust.
+
+    Raises:
+        InputError: there is no such policy, or its files are missing, damaged or not to be read.
+    """
+    method = METHODS.get(str(name_or_path))
+    if isinstance(method, Rule):
+        place = scene or T_INTERSECTION
+        return _in_scene(Contender(method.name, method.make(place), method=method.name), place)
+    if Path(name_or_path).suffix == ".zip":
+        stem = Path(name_or_path).with_suffix("")
+        found = _contender(stem, _load_zip(Path(name_or_path), allow_pickle))
+    else:
+        stem = find_policy(name_or_path)
+        found = _contender(stem, load_policy_network(stem))
+    found = replace(found, name=str(name_or_path))
+    if scene is None:
+        if found.scene == ALL_SCENES:
+            raise InputError(f"{name_or_path} was trained in all scenes; say --scene NAME to choose one")
+        _require_same_roads(stem, found)
+        return found
+    return _in_scene(found, scene)
+
+
+def _in_scene(contender: Contender, scene: AnyScene) -> Contender:
+    """The policy in another scene.
+
+    Raises:
+        InputError: there is no such scene, or it has other numbers of observed vehicles or of actions.
+    """
+    found = find_scene(scene)
+    network: Any = contender.policy
+    is_rule = contender.source is None
+    vehicles = found.max_vehicles if is_rule else network.observation_space["vehicles"].shape[0]
+    actions = RULE_ACTIONS if is_rule else network.action_space.n
+    for what, wanted, there in (
+        ("max_vehicles", vehicles, found.max_vehicles),
+        ("desired_speeds_mps", actions, len(found.ego.controller.desired_speeds_mps)),
+    ):
+        if wanted != there:
+            raise InputError(f"policy {contender.name} needs {what} of {wanted}, and scene {found.name} has {there}")
+    trained_for = DEFAULT_P_CONSERVATIVE if contender.p_conservative is None else contender.p_conservative
+    return replace(contender, scene=scene, p_conservative=None if isinstance(found, OwnScene) else trained_for)
+
+
+def _require_same_roads(stem: Path, found: Contender) -> None:
+    """Raise InputError if a policy was trained in another version of its scene."""
+    if read_policy_card(stem).get("scene_digest") != find_scene(found.scene).digest:
+        say = f"say --scene {found.scene}" if isinstance(found.scene, str) else "give the scene in a --config file"
+        raise InputError(
+            f"{card_file(stem)}: this policy was trained in another version of the scene {found.scene_name}; "
+            f"{say} to use it all the same"
+        )
+
+
+def _load_zip(file: Path, allow_pickle: bool) -> RecurrentPPO:
+    if not allow_pickle:
+        raise InputError(
+            f"{file} is a pickle, which can run any code when it is read; give the .safetensors file beside it, "
+            "or --allow-pickle if you trust the file"
+        )
+    print(f"reading {file}, a pickle: it can run any code", file=sys.stderr)
+    with preserved_random_state():
+        return RecurrentPPO.load(file)
+
+
+def _contender(stem: Path, policy: Any) -> Contender:
+    card = _checked_card(stem)
+    learned = find_learned(card["method"])
+    encoder = None if learned.encoder is None else _load_encoder(stem, card)
+    return Contender(
+        stem.name,
+        policy,
+        lambda: learned.make_source(encoder),
+        None if card["p_conservative"] is None else ends(card["p_conservative"]),
+        int(card["settings"]["action_repeat"]),
+        read_described(card),
+        learned.name,
+    )
+
+
+def _load_encoder(stem: Path, card: dict[str, Any]) -> TraitModel:
+    """The trait model that the policy was trained with: the one beside it in a run, or a shipped one by its name."""
+    named = card["traits"]
+    encoder = traits.load(weights_file(stem.with_name(TRAITS)) if named == TRAITS else named, latent_size=LATENT_SIZE)
+    if digest(encoder) != card.get("traits_sha256"):
+        raise InputError(f"{card_file(stem)} belongs to another trait model {card['traits']}; restore that model")
+    return encoder
+
+
+def find_policy(name_or_path: str | Path) -> Path:
+    """The path of a policy without its suffix.
+
+    Raises:
+        InputError: there is no such policy.
+    """
+    given = Path(name_or_path)
+    named = shipped("models") / "policies" / given
+    weights = given.with_suffix("") if given.suffix == ".safetensors" else given
+    for stem in (named, given / POLICY, weights):
+        if stem.name and weights_file(stem).is_file():
+            return stem
+    refuse_old_name(name_or_path)
+    if (given / "run.json").exists():
+        raise InputError(f"{given} holds a run that is not finished; repeat its command to finish it")
+    rules = [name for name, method in METHODS.items() if isinstance(method, Rule)]
+    raise InputError(
+        f"no policy {name_or_path}; give {', '.join([*rules, *shipped_policies()])}, the folder of a training run "
+        "or a .safetensors file"
+    )
+
+
+def shipped_policies() -> list[str]:
+    """Names of the policies that come with the package, in the order of the methods."""
+    return [name for name in METHODS if weights_file(shipped("models") / "policies" / name).is_file()]
+
+
+def _checked_card(stem: Path) -> dict[str, Any]:
+    card = read_policy_card(stem)
+    refuse_old_name(card.get("method"))
+    method = METHODS.get(str(card.get("method")))
+    settings = card.get("settings")
+    share = card.get("p_conservative")
+    fits = isinstance(method, Learned) and (is_share(share) or (share is None and "scene_settings" in card))
+    fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
+    fits &= "scene_settings" in card or str(card.get("scene")) in (*SCENES, ALL_SCENES)
+    if not fits or (isinstance(method, Learned) and method.encoder and not _is_file_name(card.get("traits"))):
+        raise InputError(f"{card_file(stem)} is not the card of a policy; restore the file or train the policy again")
+    return card
+
+
+def _is_file_name(value: object) -> bool:
+    return isinstance(value, str) and value != "" and Path(value).name == value

@@ -1,0 +1,185 @@
+"""The methods of the study. A new one is one entry here (and its rule or trait source)."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tint_sumo.config import PpoSettings
+from tint_sumo.core.errors import InputError, find_named, refuse_old_name
+from tint_sumo.methods.rules import AlwaysGo, TimeToCollision
+from tint_sumo.policy.trait_sources import (
+    ClassifierTraits,
+    EncoderTraits,
+    NoTraits,
+    OracleTraits,
+    StreamingTraits,
+    TraitSource,
+)
+from tint_sumo.scenes import AnyScene
+from tint_sumo.traits import TraitModel
+
+
+class Policy(Protocol):
+    """What drives the ego: a rule, or a Stable-Baselines3 policy."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], Any]:
+        """Actions (N,) for N observations, and the state for the next call."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a method is drawn in every figure, in the report and in films.
+
+    Colours are of middling lightness, to be seen on white and on black, and far apart with each kind of colour
+    blindness. Markers and dashes differ, too.
+    """
+
+    colour: str = "#70757a"  # "#rrggbb"
+    marker: str = "o"  # Matplotlib's
+    dash: str = "-"  # Matplotlib's line style
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A hand-written policy."""
+
+    name: str
+    title: str  # name in tables and figures
+    make: Callable[[AnyScene], Policy]
+    look: Look = Look()
+
+
+@dataclass(frozen=True)
+class Learned:
+    """The policy network trained with PPO, and where its traits come from."""
+
+    name: str
+    title: str
+    source: Callable[..., TraitSource]  # takes the trait model if there is one
+    encoder: str | None = None  # trait method (``tint_sumo.traits.TRAIT_METHODS``) whose model it needs
+    attention: bool = True
+    critic_sees_true_traits: bool = False  # only in training; the policy itself never sees them
+    trained_as: str | None = None  # the method whose training it shares, if it drives with other traits than it learnt
+    look: Look = Look()
+
+    @property
+    def sees_true_traits(self) -> bool:
+        """Whether its training does."""
+        return self.source is OracleTraits or self.critic_sees_true_traits or self.trained_as is not None
+
+    def make_source(self, encoder: TraitModel | None) -> TraitSource:
+        """A new source of traits."""
+        return self.source() if encoder is None else self.source(encoder)
+
+    def settings_of(self, settings: PpoSettings) -> PpoSettings:
+        """Return settings of PPO with the network of this method.
+
+        Raises:
+            InputError: they leave out the attention, which this method has.
+        """
+        if self.attention and not settings.policy.attention:
+            raise InputError(
+                f"whether there is attention is part of the method, and {self.name} has it; "
+                "leave policy.attention out, or choose the method no_attention"
+            )
+        return replace(settings, policy=replace(settings.policy, attention=self.attention))
+
+
+Method = Rule | Learned
+
+METHODS: dict[str, Method] = {}
+
+
+def register(method: Method) -> Method:
+    """Make a method known under its name.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    if method.name in METHODS:
+        raise ValueError(f"two methods are called {method.name!r}")
+    METHODS[method.name] = method
+    return method
+
+
+def find_method(name: str) -> Method:
+    """The method called ``name``.
+
+    Raises:
+        InputError: there is none.
+    """
+    refuse_old_name(name)
+    return find_named("method", name, METHODS)
+
+
+def find_learned(name: str) -> Learned:
+    """The same for methods that learn.
+
+    Raises:
+        InputError: there is none, or it is a hand-written rule.
+    """
+    method = find_method(name)
+    if isinstance(method, Rule):
+        learned = ", ".join(one.name for one in METHODS.values() if isinstance(one, Learned))
+        raise InputError(f"{name!r} is a hand-written rule and needs no training; choose one of: {learned}")
+    return method
+
+
+def with_shared_trainings(names: Iterable[str]) -> list[str]:
+    """Return the names of learned methods, those whose training others share first, each of them once."""
+    methods = [find_learned(name) for name in names]
+    shared = [method.trained_as for method in methods if method.trained_as is not None]
+    return list(dict.fromkeys([*shared, *(method.name for method in methods)]))
+
+
+def look_of(name: str) -> Look:
+    """Return how a method is drawn; in grey if nobody has registered it."""
+    return METHODS[name].look if name in METHODS else Look()
+
+
+def look_of_encoder(name: str) -> Look:
+    """Return how a trait method is drawn: as the first method that drives with its traits."""
+    users = (one for one in METHODS.values() if isinstance(one, Learned) and one.encoder == name)
+    return next((one.look for one in users), Look())
+
+
+register(Rule("always_go", "always go", lambda _: AlwaysGo(), look=Look("#5444fd", "o", ":")))
+register(Rule("ttc", "time to collision", lambda scene: TimeToCollision(scene=scene), look=Look("#8f9047", "s", ":")))
+register(Learned("no_labels", "no labels", NoTraits, look=Look("#1793fc", "D", "-")))
+register(Learned("morton", "Morton", EncoderTraits, encoder="morton", look=Look("#d77e0b", "^", "--")))
+register(Learned("vae", "paper's method", EncoderTraits, encoder="vae", look=Look("#197847", "v", "-")))
+register(
+    Learned(
+        "no_attention",
+        "paper's, no attention",
+        EncoderTraits,
+        encoder="vae",
+        attention=False,
+        look=Look("#ce1306", "P", "--"),
+    )
+)
+register(Learned("cross_window", "cross-window", EncoderTraits, encoder="cross_window", look=Look("#884bb5", "*", "-")))
+register(Learned("streaming", "streaming", StreamingTraits, encoder="cross_window", look=Look("#c0867a", "X", "-.")))
+register(
+    Learned(
+        "streaming_critic",
+        "streaming, informed critic",
+        StreamingTraits,
+        encoder="cross_window",
+        critic_sees_true_traits=True,
+        look=Look("#fc329e", "h", "-."),
+    )
+)
+register(
+    Learned("ma", "Ma", ClassifierTraits, encoder="classifier", trained_as="oracle", look=Look("#15a1bb", "<", "--"))
+)
+register(Learned("oracle", "oracle", OracleTraits, look=Look("#646971", ">", "-")))

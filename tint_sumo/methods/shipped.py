@@ -1,0 +1,91 @@
+"""The models that the package ships, as their cards tell of them."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tint_sumo.config import share_words
+from tint_sumo.core.errors import find_named
+from tint_sumo.core.files import read_json, shipped
+from tint_sumo.core.percentages import percent
+
+_FOLDERS = {"trait model": ".", "policy": "policies"}  # by kind, in the folder of the models
+_SHOWN_MIXES = ("P 0.25", "P 0.4", "P 0.6")  # of the results in a policy's card
+
+
+@dataclass(frozen=True)
+class ShippedModel:
+    """A model, and in a few words how it was trained and how good it is."""
+
+    name: str
+    kind: str  # "trait model" or "policy"
+    method: str
+    scene: str
+    training: str
+    result: str
+    card: Mapping[str, Any]
+
+    def summary(self) -> dict[str, str]:
+        """Return all but the card."""
+        return {key: value for key, value in vars(self).items() if key != "card"}
+
+
+def shipped_models() -> list[ShippedModel]:
+    """Return all models that are shipped, trait models first, by name.
+
+    Raises:
+        InputError: a card is damaged.
+    """
+    return [
+        _described(kind, weights)
+        for kind, folder in _FOLDERS.items()
+        for weights in sorted((shipped("models") / folder).glob("*.safetensors"))
+    ]
+
+
+def models_named(name: str) -> list[ShippedModel]:
+    """Return the models of a name: a trait model, a policy, or one of each.
+
+    Raises:
+        InputError: none has it.
+    """
+    by_name: dict[str, list[ShippedModel]] = {}
+    for model in shipped_models():
+        by_name.setdefault(model.name, []).append(model)
+    return find_named("shipped model", name, by_name)
+
+
+def models_table(models: Sequence[ShippedModel]) -> str:
+    """Return a line for each model, below a line of headings."""
+    rows = [list(models[0].summary()), *(list(model.summary().values()) for model in models)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+
+
+def card_text(model: ShippedModel) -> str:
+    """Return a model's card as JSON, below what it is."""
+    return f"{model.kind} {model.name}\n{json.dumps(model.card, indent=2)}"
+
+
+def _described(kind: str, weights: Path) -> ShippedModel:
+    card = read_json(weights.with_suffix(".json"), f"card of the {kind}")
+    if kind == "policy":
+        scene, training, result = card["scene"], _policy_training(card), _policy_result(card["results"])
+    else:
+        data, settings = card["data"], card["settings"]
+        scene = data["scene"]
+        training = f"{card['windows']:,} windows, P {share_words(data['p_conservative'])}, {settings['epochs']} epochs"
+        result = f"{percent(card['accuracy'])}% of windows (linear SVC, noise {settings['noise_m']:g} m)"
+    return ShippedModel(weights.stem, kind, card["method"], scene, training, result, card)
+
+
+def _policy_training(card: Mapping[str, Any]) -> str:
+    traits = f", traits of {card['traits']}" if card["traits"] else ""
+    return f"{card['steps']:,} decisions, P {share_words(card['p_conservative'])}, seed {card['seed']}{traits}"
+
+
+def _policy_result(results: Mapping[str, Any]) -> str:
+    shown = [f"{percent(results[mix]['success'])}% at {mix}" for mix in _SHOWN_MIXES]
+    return f"success {', '.join(shown)} (mean of {len(results[_SHOWN_MIXES[0]]['seeds'])} seeds)"

@@ -1,0 +1,397 @@
+"""Training of one policy: interruptible and resumable."""
+
+import csv
+import hashlib
+import io
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
+
+from tint_sumo import traits as trait_models
+from tint_sumo.config import LATENT_SIZE, SNAPSHOTS_PERCENT, PpoSettings, Share, ends, require_share
+from tint_sumo.core.checkpoints import remove_checkpoint, write_checkpoint
+from tint_sumo.core.determinism import preserved_random_state, single_threaded
+from tint_sumo.core.errors import DivergedError, InputError, NotFiniteError
+from tint_sumo.core.files import claim_folder, write_text
+from tint_sumo.core.progress import Progress, Report, silent
+from tint_sumo.core.provenance import versions
+from tint_sumo.core.training_log import log_film, open_log
+from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.methods.checkpoint import make_checkpoint, restore_checkpoint
+from tint_sumo.methods.evaluation import CASE_SEED, require_seed
+from tint_sumo.methods.registry import Learned, find_learned
+from tint_sumo.policy import GruPolicy, RecurrentPPO
+from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
+from tint_sumo.policy.venv import policy_venv
+from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnScene, described, find_scene
+from tint_sumo.traits import TraitModel
+from tint_sumo.traits.storage import read_card, require_scene, save
+
+FilmMaker = Callable[[Path], bytes | None]  # a GIF of the policy in a file; None where there can be none
+
+CHECKPOINT_INTERVAL_S = 15.0
+POLICY = "policy"  # name of the policy in the folder of a run
+ZIP_FILE = "policy.zip"
+CURVE_FILE = "curve.csv"
+TRAITS = "traits"  # name of the trait model beside a policy
+RECENT_EPISODES = 500
+
+
+def snapshot_stem(out: Path, percent: int) -> Path:
+    """Where a run keeps its policy after some percent of the training, without suffix."""
+    return out / (POLICY if percent == 100 else f"{POLICY}-{percent}")
+
+
+def train_policy(
+    method: str,
+    p_conservative: Share | None,
+    steps: int,
+    seed: int,
+    out: Path,
+    *,
+    settings: PpoSettings,
+    scene: AnyScene = T_INTERSECTION,
+    traits: str | Path | None = None,
+    other_scene: bool = False,
+    with_zip: bool = False,
+    film: FilmMaker | None = None,
+    report: Report = silent,
+) -> Path:
+    """Train a policy and write it as policy.safetensors with its card policy.json.
+
+    Beside them stand the policies after 25 and 50 % of the training, the training's curve (outcomes of the last
+    episodes by decisions), a TensorBoard log and, where the method infers traits, its trait model. An interrupted run
+    leaves a checkpoint, and the same call goes on from there. A finished run is not repeated.
+
+    The policy follows from the arguments alone: the training computes in one thread, nobody who looks on changes its
+    random numbers, and the process's own are as before when it ends.
+
+    Args:
+        method: name of a learned method.
+        p_conservative: share of conservative drivers it trains among; a range: each episode draws its own. None in a
+            SUMO configuration, whose demand tells who drives.
+        steps: decisions of the policy, at least; training ends with a whole rollout.
+        seed: of weights, actions and environments, 0 to 1000.
+        out: a new folder, or the one of this very run.
+        settings: network and PPO; its ``total_steps`` is not used.
+        scene: the scene it trains in, or ``"all"``.
+        traits: trait model by name or path, for methods that infer traits; the shipped one if not given.
+        other_scene: take a trait model that was trained in another scene, too.
+        with_zip: write the policy as Stable-Baselines3's policy.zip, too.
+        film: makes a GIF of the policy in a file, for the TensorBoard log, such as
+            ``tint_sumo.films.training_films.film_policy``; called with each of the kept policies.
+        report: told of the progress.
+
+    Returns:
+        The path of policy.safetensors.
+
+    Raises:
+        InputError: bad values, no such method or trait model, ``out`` holds another run, or its checkpoint is damaged.
+        DivergedError: a loss or a weight is not finite; the checkpoint is of before that.
+    """
+    learned = find_learned(method)
+    _require_drivers(learned, p_conservative, scene)
+    require_seed(seed)
+    if steps < 1:
+        raise InputError(f"steps must be at least 1, not {steps}")
+    if learned.encoder is None and (traits is not None or other_scene):
+        raise InputError(f"method {method} infers no traits; leave the trait model and other_scene out")
+    encoder = _load_encoder(learned, traits)
+    place = described(scene)
+    if encoder is not None and not other_scene:
+        require_scene(traits or str(learned.encoder), place["scene"], place["scene_digest"], "the policy")
+    settings = learned.settings_of(settings)
+    identity = {
+        "kind": "policy",
+        "method": method,
+        "p_conservative": None if p_conservative is None else list(ends(p_conservative)),
+        "steps": steps,
+        "seed": seed,
+        **place,
+        "settings": asdict(settings),
+        "traits": None if encoder is None else digest(encoder),
+    }
+    # The training draws from the global random numbers: those who look on must not.
+    report = preserved_random_state()(report)
+    film = None if film is None else preserved_random_state()(film)
+    stem = snapshot_stem(out, 100)
+    with claim_folder(out, identity, with_versions=False):  # the card has them
+        if with_zip and card_file(stem).exists() and not (out / ZIP_FILE).exists():
+            raise InputError(f"{out} holds a finished run without {ZIP_FILE}; train into another folder to have one")
+        if not card_file(stem).exists():
+            if encoder is not None:
+                save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
+            card = _card(identity, encoder)
+            venv = training_venv(learned, encoder, p_conservative, settings, scene)
+            try:
+                with preserved_random_state(), single_threaded():
+                    model = _learn(venv, steps, seed, out, settings, card, film, report)
+            finally:
+                venv.close()
+            if with_zip:
+                model.save(out / ZIP_FILE)
+            save_policy(model.policy, stem, card)
+            _log_film(model, stem, film)
+            remove_checkpoint(out)
+        return stem.with_suffix(".safetensors")
+
+
+def share_training(source: Path, method: str, out: Path, traits: str | Path | None = None) -> None:
+    """Write the policies of a finished run as those of a method that is trained in the same way.
+
+    Args:
+        source: folder of the run.
+        method: one that is ``trained_as`` that run's method, and drives with other traits.
+        out: a new folder, or the one of this very call.
+        traits: trait model by name or path; the shipped one if not given.
+    """
+    learned = find_learned(method)
+    encoder = _load_encoder(learned, traits)
+    assert encoder is not None
+    shared = read_policy_card(snapshot_stem(source, 100))
+    training = {key: shared[key] for key in ("method", "p_conservative", "steps", "seed", "scene")}
+    with claim_folder(out, {"kind": "policy", "method": method, "traits": digest(encoder), "training": training}):
+        save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
+        for percent in (*SNAPSHOTS_PERCENT, 100):
+            stem = snapshot_stem(source, percent)
+            own = {"method": method, "trained_as": learned.trained_as} | _traits_entries(encoder)
+            save_policy(load_policy_network(stem), snapshot_stem(out, percent), {**read_policy_card(stem), **own})
+
+
+def _require_drivers(learned: Learned, p_conservative: Share | None, scene: AnyScene) -> None:
+    """Raise InputError unless a method can be trained among a scene's drivers, in such a mix."""
+    played = T_INTERSECTION if scene == ALL_SCENES else scene
+    found = find_scene(played)
+    if isinstance(found, OwnScene):
+        kinds = len(found.vtypes)
+        if p_conservative is not None:
+            raise InputError("the demand of a .sumocfg tells who drives how; leave p_conservative out")
+    else:
+        kinds = len(found.population.profiles)
+        require_share(found.traffic.p_conservative if p_conservative is None else p_conservative)
+    if learned.sees_true_traits and kinds != 2:
+        raise InputError(
+            f"method {learned.name} is told which of two kinds of drivers each one is of, and scene {found.name} has "
+            f"{kinds}; choose another method"
+        )
+
+
+def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | None:
+    if learned.encoder is None:
+        return None
+    encoder = trait_models.load(traits or learned.encoder, latent_size=LATENT_SIZE)
+    learned.make_source(encoder)  # refuses a model of another method where it needs one of its own
+    return encoder
+
+
+def training_venv(
+    learned: Learned,
+    encoder: TraitModel | None,
+    p_conservative: Share | None,
+    settings: PpoSettings,
+    scene: AnyScene = T_INTERSECTION,
+) -> VecEnv:
+    """Environments with the traits that the method is trained with."""
+    played = [find_scene(one) for one in (SCENES if scene == ALL_SCENES else [scene])]
+    shown = learned if learned.trained_as is None else find_learned(learned.trained_as)
+    return policy_venv(
+        settings.n_envs,
+        shown.make_source(encoder if shown.encoder else None),
+        action_repeat=settings.action_repeat,
+        critic_sees_true_traits=learned.critic_sees_true_traits,
+        monitored=True,
+        scene=list(SCENES) if scene == ALL_SCENES else scene,
+        p_conservative=p_conservative,
+        time_limit_s=min(settings.time_limit_s, *(one.time_limit_s for one in played)),
+    )
+
+
+def _learn(
+    venv: VecEnv,
+    steps: int,
+    seed: int,
+    out: Path,
+    settings: PpoSettings,
+    card: Mapping[str, Any],
+    film: FilmMaker | None,
+    report: Report,
+) -> RecurrentPPO:
+    """Train from the checkpoint, if there is one, to ``steps``."""
+    model = new_model(venv, seed, settings)
+    venv.seed(_training_seed(seed))
+    recent = restore_checkpoint(out, model)
+    done = model.num_timesteps
+    told = {key: card[key] for key in ("method", "p_conservative", "scene", "seed", "steps", "settings")}
+    model.set_logger(open_log(out, told, [f"rollout/{outcome}" for outcome in OUTCOMES], done))
+    if done < steps:
+        report(Progress(done, steps, "step"))
+        watch = _Watch(out, steps, card, film, report, recent)
+        try:
+            model.learn(steps - done, callback=watch, reset_num_timesteps=False)
+        except KeyboardInterrupt:
+            watch.write_checkpoint()
+            raise
+        except DivergedError as error:
+            watch.write_checkpoint()
+            raise DivergedError(f"{error}; the checkpoint in {out} holds the last finite policy") from None
+    return model
+
+
+def _log_film(model: BaseAlgorithm, stem: Path, film: FilmMaker | None) -> None:
+    """Log a film of the policy that has just been kept.
+
+    Raises:
+        DivergedError: the policy's outputs are not finite in the film.
+    """
+    try:
+        gif = None if film is None else film(weights_file(stem))
+    except NotFiniteError:
+        problem = (
+            f"the training diverged at step {model.num_timesteps}: the policy's outputs in its film are not finite"
+        )
+        raise DivergedError(f"{problem}; choose a lower learning_rate") from None
+    if gif is not None:
+        log_film(model.logger, "film", gif, model.num_timesteps)
+
+
+def new_model(venv: VecEnv, seed: int, settings: PpoSettings) -> RecurrentPPO:
+    return RecurrentPPO(
+        "GruPolicy",
+        venv,
+        learning_rate=LinearSchedule(settings.learning_rate, 0.0, 1.0),
+        n_steps=settings.n_steps,
+        n_minibatches=settings.n_minibatches,
+        n_epochs=settings.n_epochs,
+        gamma=settings.gamma,
+        gae_lambda=settings.gae_lambda,
+        clip_range=settings.clip_range,
+        ent_coef=LinearSchedule(settings.ent_coef, settings.final_ent_coef, 1.0),
+        vf_coef=settings.vf_coef,
+        max_grad_norm=settings.max_grad_norm,
+        policy_kwargs={"settings": settings.policy},
+        seed=seed,
+    )
+
+
+def _training_seed(seed: int) -> int:
+    """Seed of the first environment; below every case's seed."""
+    sequence = np.random.SeedSequence((seed, 0))  # of two numbers, as when the shipped policies were trained
+    return int(sequence.generate_state(1)[0]) % (CASE_SEED // 2)
+
+
+class _Watch(BaseCallback):
+    """Keeps checkpoints, snapshots and the curve of the training, and reports the outcomes of recent episodes.
+
+    A checkpoint is the state between two rollouts: within one, steps are counted from which nothing is learnt yet.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        steps: int,
+        card: Mapping[str, Any],
+        film: FilmMaker | None,
+        report: Report,
+        recent: tuple[str, ...],
+    ) -> None:
+        super().__init__()
+        self._out = out
+        self._steps = steps
+        self._card = card
+        self._film = film
+        self._report = report
+        self._recent: deque[str] = deque(recent, maxlen=RECENT_EPISODES)
+        self._saved_at = time.monotonic()
+        self._state = b""
+        self._curve: list[list[str]] = []
+
+    def _on_training_start(self) -> None:
+        """Go on with the curve up to the checkpoint."""
+        rows = read_curve(self._out) if self.num_timesteps else []
+        self._curve = [row for row in rows if int(row[0]) <= self.num_timesteps]
+
+    def _on_rollout_start(self) -> None:
+        assert isinstance(self.model, RecurrentPPO)
+        self._state = make_checkpoint(self.model, self._recent)
+        if time.monotonic() - self._saved_at >= CHECKPOINT_INTERVAL_S:
+            self.write_checkpoint()
+            self._saved_at = time.monotonic()
+        self._keep_snapshots()
+
+    def _keep_snapshots(self) -> None:
+        for percent in SNAPSHOTS_PERCENT:
+            stem = snapshot_stem(self._out, percent)
+            if self.num_timesteps * 100 >= percent * self._steps and not card_file(stem).exists():
+                assert isinstance(self.model.policy, GruPolicy)
+                save_policy(self.model.policy, stem, {**self._card, "decisions": self.num_timesteps})
+                _log_film(self.model, stem, self._film)
+
+    def write_checkpoint(self) -> None:
+        """Write the state at the start of the present rollout, if there is one."""
+        if self._state:
+            self._write_curve()
+            write_checkpoint(self._out, self._state)
+
+    def _write_curve(self) -> None:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([("decisions", *OUTCOMES), *self._curve])
+        write_text(self._out / CURVE_FILE, text.getvalue())
+
+    def _on_step(self) -> bool:
+        infos: list[dict[str, Any]] = self.locals["infos"]
+        self._recent.extend(infos[index]["outcome"] for index in np.flatnonzero(self.locals["dones"]))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        measures: dict[str, float] = {}
+        if self._recent:
+            shares = {outcome: self._recent.count(outcome) / len(self._recent) for outcome in OUTCOMES}
+            for outcome, share in shares.items():
+                self.logger.record(f"rollout/{outcome}", share)
+            self._curve.append([str(self.num_timesteps), *(f"{share:.4f}" for share in shares.values())])
+            measures = {outcome: shares[outcome] for outcome in ("success", "collision")}
+        self._report(Progress(min(self.num_timesteps, self._steps), self._steps, "step", measures))
+
+    def _on_training_end(self) -> None:
+        self._write_curve()
+        self._keep_snapshots()  # those that only the last rollout has reached
+
+
+def read_curve(out: Path) -> list[list[str]]:
+    """Rows of a training's curve: decisions, then the shares of the outcomes; none if there is no file yet."""
+    try:
+        lines = (out / CURVE_FILE).read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return []
+    return list(csv.reader(lines[1:]))
+
+
+def digest(encoder: TraitModel) -> str:
+    """What tells a trait model's weights from others."""
+    return hashlib.sha256(safetensors.torch.save(encoder.state_dict())).hexdigest()
+
+
+def _traits_entries(encoder: TraitModel | None) -> dict[str, Any]:
+    """What the card says of the trait model beside the policy."""
+    if encoder is None:
+        return {"traits": None, "traits_sha256": None}
+    return {"traits": TRAITS, "traits_sha256": digest(encoder)}
+
+
+def _card(identity: Mapping[str, Any], encoder: TraitModel | None) -> dict[str, Any]:
+    packages = ("tint_sumo", "libsumo", "torch", "stable-baselines3", "gymnasium", "numpy")
+    return {
+        **{key: value for key, value in identity.items() if key != "kind"},
+        **_traits_entries(encoder),
+        "versions": versions(packages),
+    }

@@ -1,0 +1,319 @@
+"""Scenes of one's own: any SUMO configuration, with its own network and demand, through which the ego is driven.
+
+The drivers are those of the configuration, and so are the rules by which they meet the ego: SUMO's. Whoever wants to
+learn their traits takes their vTypes for labels.
+"""
+
+import gzip
+import hashlib
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, ClassVar
+from xml.etree import ElementTree
+from xml.sax import SAXException
+
+import sumolib
+
+from tint_sumo.config import Claim, DistanceM, EgoController, Slots, TimeS, VehicleShape, WarmUpS
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.ranges import require_ranges
+from tint_sumo.core.reading import TABLE_BYTES, require_file
+from tint_sumo.scenes.scene import EgoTask
+
+NET_VERSION = (1, 20)  # the version that this SUMO's netconvert writes into networks
+MOST_VTYPES = 127  # labels are numbers of one byte
+DEFAULT_VTYPE = "DEFAULT_VEHTYPE"  # SUMO's type for vehicles that name none
+_EGO_CLASS = "passenger"
+_DEFAULT_STEP_S = 1.0  # SUMO's
+# Each of these options and SUMO's other names for it.
+_NET, _ROUTES = ("net-file", "net", "n"), ("route-files", "routes", "r")
+_ADDITIONAL = ("additional-files", "additional", "a")
+_OUTPUTS = ("netstate-dump", "netstate", "log", "message-log", "error-log")  # and all options that end with -output
+
+
+@dataclass(frozen=True)
+class SumoConfig:
+    """What a .sumocfg says, as far as it has to be known outside of SUMO; paths are absolute."""
+
+    file: Path
+    net_file: Path
+    demand_files: tuple[Path, ...]  # routes and additional files
+    step_s: float
+    outputs: tuple[str, ...]  # options that would write files
+
+    @property
+    def name(self) -> str:
+        return self.file.name.removesuffix(".sumocfg")
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All that the simulation follows from."""
+        return (self.file, self.net_file, *self.demand_files)
+
+    @property
+    def digest(self) -> str:
+        """What tells the configuration's input from others'."""
+        whole = hashlib.sha256()
+        for file in self.files:
+            with file.open("rb") as content:
+                whole.update(hashlib.file_digest(content, "sha256").digest())
+        return whole.hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class OwnScene:
+    """A SUMO configuration and the ego's task in it; ``from_sumocfg`` makes one.
+
+    Lengths along the ego's route are those that SUMO's odometer shows, lanes on junctions included. Vehicles are seen
+    up to ``sight_m`` away, the nearest ``max_vehicles`` of them.
+    """
+
+    claim: ClassVar[Claim] = Claim()  # not used: SUMO's own rules decide who yields
+
+    name: str
+    config: SumoConfig
+    vtypes: tuple[str, ...]  # the labels: ids of all vTypes of vehicles, sorted
+    ego_route: tuple[str, ...]
+    start_m: float
+    goal_m: float
+    route_edge_start_m: tuple[float, ...]  # start of each edge along the route
+    max_vehicles: Slots = 12
+    sight_m: DistanceM = 50.0
+    warm_up_s: WarmUpS = 30.0  # the traffic runs for so long before the ego appears
+    time_limit_s: TimeS = 50.0
+    vehicle: VehicleShape = field(default_factory=VehicleShape)
+    controller: EgoController = field(default_factory=EgoController)
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+    @property
+    def step_s(self) -> float:
+        return self.config.step_s
+
+    @property
+    def digest(self) -> str:
+        return self.config.digest
+
+    @property
+    def ego(self) -> EgoTask:
+        """The task; the controller's gain is such that a speed is reached, and not passed, in a step of any length."""
+        controller = replace(self.controller, gain_per_s=min(self.controller.gain_per_s, 1.0 / self.step_s))
+        return EgoTask(self.ego_route, self.start_m, self.goal_m, controller=controller)
+
+    @property
+    def departure(self) -> tuple[tuple[str, ...], float]:
+        """The edges from the one on that the ego starts on, and where on the first of them its front is."""
+        number = max(index for index, edge_m in enumerate(self.route_edge_start_m) if edge_m <= self.start_m)
+        return self.ego_route[number:], self.start_m - self.route_edge_start_m[number]
+
+
+def from_sumocfg(
+    sumocfg: str | Path,
+    ego_route: Sequence[str],
+    start_m: float,
+    goal_m: float,
+    *,
+    max_vehicles: int = OwnScene.max_vehicles,
+    sight_m: float = OwnScene.sight_m,
+    warm_up_s: float = OwnScene.warm_up_s,
+    time_limit_s: float = OwnScene.time_limit_s,
+    vehicle: VehicleShape | None = None,
+    controller: EgoController | None = None,
+) -> OwnScene:
+    """A scene of the configuration's network and demand.
+
+    Args:
+        sumocfg: SUMO configuration; its step length is the scene's.
+        ego_route: edges that the ego drives along, one after the other.
+        start_m: where on its route the ego's front is at the beginning; not on a junction.
+        goal_m: the ego's front past it is a success.
+        max_vehicles: how many vehicles are observed at most, the nearest ones.
+        sight_m: how far away they may be.
+        warm_up_s: for how long the traffic runs before the ego appears.
+        time_limit_s: of an episode.
+        vehicle: the ego's shape.
+        controller: how the ego drives, and which desired speeds are its actions.
+
+    Raises:
+        InputError: files are missing or of a newer SUMO, the route does not exist or is not connected, or the ego's
+            start and goal are not on it, one behind the other.
+    """
+    config = read_config(Path(sumocfg))
+    net = read_net(config.net_file)
+    edge_start_m, spans_m, length_m = _measured(net, tuple(ego_route))
+    if not 0.0 <= start_m < goal_m <= length_m:
+        raise InputError(
+            f"the ego's start ({start_m:g} m) and goal ({goal_m:g} m) must lie on its route one behind the other, "
+            f"from 0 to {length_m:.1f} m"
+        )
+    if not any(first_m <= start_m <= last_m for first_m, last_m in spans_m):
+        ends = ", ".join(f"{first_m:.1f} to {last_m:.1f}" for first_m, last_m in spans_m)
+        raise InputError(f"the ego's start ({start_m:g} m) is on a junction; its route's edges are at {ends} m")
+    return OwnScene(
+        name=config.name,
+        config=config,
+        vtypes=read_vtypes(config),
+        ego_route=tuple(ego_route),
+        start_m=float(start_m),
+        goal_m=float(goal_m),
+        route_edge_start_m=edge_start_m,
+        max_vehicles=max_vehicles,
+        sight_m=sight_m,
+        warm_up_s=warm_up_s,
+        time_limit_s=time_limit_s,
+        vehicle=vehicle or VehicleShape(),
+        controller=controller or EgoController(),
+    )
+
+
+def read_config(file: Path) -> SumoConfig:
+    """Look at a SUMO configuration.
+
+    Raises:
+        InputError: there is none, it is damaged, or files that it names are missing.
+    """
+    file = file.resolve()
+    options = {}
+    for element in _elements(file, "SUMO configuration"):
+        value = element.get("value", element.get("v"))
+        if value is not None:
+            options[element.tag] = value
+    net_files, *demand = (_files(file, options, names) for names in (_NET, _ADDITIONAL, _ROUTES))
+    if len(net_files) != 1:
+        raise InputError(f"{file} names no net-file; give a .sumocfg with one")
+    return SumoConfig(
+        file=file,
+        net_file=net_files[0],
+        demand_files=tuple(one for files in demand for one in files),
+        step_s=_seconds(options.get("step-length", str(_DEFAULT_STEP_S)), file),
+        outputs=tuple(name for name in options if name.endswith("-output") or name in _OUTPUTS),
+    )
+
+
+def _files(config: Path, options: dict[str, str], names: tuple[str, ...]) -> list[Path]:
+    """The files of an option, which stand in relation to the configuration's folder."""
+    value = next((options[name] for name in names if name in options), "")
+    files = [config.parent / part.strip() for part in value.split(",") if part.strip()]
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"{config} names {names[0]} {file}, and there is no such file; correct the path")
+    return files
+
+
+def _seconds(text: str, file: Path) -> float:
+    """A time of SUMO's, in seconds or as hours:minutes:seconds."""
+    try:
+        step_s = 0.0
+        for part in text.split(":"):
+            step_s = step_s * 60.0 + float(part)
+    except ValueError:
+        step_s = math.nan
+    if not 0.001 <= step_s <= 10.0:  # SUMO's shortest
+        raise InputError(f"{file} has step-length {text!r}; give a number of seconds from 0.001 to 10, such as 0.1")
+    return step_s
+
+
+def _elements(file: Path, what: str) -> Iterator[Any]:
+    """All elements of an XML file, forgotten one by one.
+
+    Raises:
+        InputError: there is no such file, or it is damaged.
+    """
+    require_file(file, what, TABLE_BYTES)
+    try:
+        with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as text:
+            for _, element in ElementTree.iterparse(text):
+                yield element
+                element.clear()
+    except (ElementTree.ParseError, OSError, EOFError) as error:
+        raise InputError(f"{what}: {file} is damaged ({error}); make it anew") from None
+
+
+def read_vtypes(config: SumoConfig) -> tuple[str, ...]:
+    """Ids of the vTypes of a configuration's vehicles, in place of distributions their members; sorted.
+
+    Raises:
+        InputError: a file is damaged, or there are too many vTypes.
+    """
+    defined: set[str] = set()
+    used: set[str] = set()
+    distributions: set[str] = set()
+    for file in config.demand_files:
+        for element in _elements(file, "demand"):
+            if element.tag == "vType" and element.get("vClass") != "pedestrian":
+                defined.add(element.get("id"))
+            elif element.tag == "vTypeDistribution":
+                distributions.add(element.get("id"))
+            elif element.tag in ("vehicle", "trip", "flow"):
+                used.add(element.get("type", DEFAULT_VTYPE))
+    found = tuple(sorted(defined | (used - distributions)))
+    if len(found) > MOST_VTYPES:
+        raise InputError(f"{config.file} has {len(found)} vTypes; at most {MOST_VTYPES} can be told apart: use fewer")
+    return found
+
+
+def read_net(file: Path, *, with_internal: bool = True) -> Any:
+    """A SUMO network, as sumolib has it.
+
+    Raises:
+        InputError: there is no such file, it is no network, or one of a newer SUMO.
+    """
+    require_file(file, "SUMO network", TABLE_BYTES)
+    try:
+        net = sumolib.net.readNet(str(file), withInternal=with_internal)
+    except (SAXException, ValueError, KeyError, OSError, EOFError) as error:
+        raise InputError(f"{file} is not a SUMO network ({error}); give the scenario's .net.xml") from None
+    version = net.getVersion()
+    if version is None:
+        raise InputError(f"{file} is not a SUMO network; give the scenario's .net.xml")
+    if tuple(map(int, version)) > NET_VERSION:
+        found, known = (".".join(str(int(part)) for part in one) for one in (version, NET_VERSION))
+        raise InputError(
+            f"{file} is a network of version {found}, which is of a newer SUMO than the one installed (up to {known}); "
+            "build it again with this one's netconvert"
+        )
+    return net
+
+
+def _measured(net: Any, edges: tuple[str, ...]) -> tuple[tuple[float, ...], list[tuple[float, float]], float]:
+    """Where a route's edges start on it, from where to where they are, and the route's length."""
+    if not edges:
+        raise InputError("ego_route is empty; give the edges that the ego drives along")
+    unknown = [edge for edge in edges if not net.hasEdge(edge)]
+    if unknown:
+        raise InputError(f"ego_route: the network has no edge {unknown[0]!r}")
+    closed = [edge for edge in edges if not net.getEdge(edge).allows(_EGO_CLASS)]
+    if closed:
+        raise InputError(f"ego_route: edge {closed[0]!r} is closed to passenger cars")
+    lengths_m = [float(net.getEdge(edge).getLength()) for edge in edges]
+    starts_m = [0.0]
+    for (edge, after), length_m in zip(pairwise(edges), lengths_m, strict=False):
+        starts_m.append(starts_m[-1] + length_m + _junction_m(net, edge, after))
+    spans_m = [(start_m, start_m + length_m) for start_m, length_m in zip(starts_m, lengths_m, strict=True)]
+    return tuple(starts_m), spans_m, spans_m[-1][1]
+
+
+def _junction_m(net: Any, edge: str, after: str) -> float:
+    """Length of the shortest way over the junction between two edges."""
+    ways = [
+        _internal_m(net, way.getViaLaneID())
+        for way in net.getEdge(edge).getOutgoing().get(net.getEdge(after), [])
+        if way.getFromLane().allows(_EGO_CLASS) and way.getToLane().allows(_EGO_CLASS)
+    ]
+    if not ways:
+        raise InputError(f"ego_route: no way for passenger cars leads from edge {edge!r} to edge {after!r}")
+    return min(ways)
+
+
+def _internal_m(net: Any, via: str) -> float:
+    """Length of a lane on a junction and, where it has a place to wait in its middle, of the rest."""
+    length_m = 0.0
+    while via:
+        lane = net.getLane(via)
+        length_m += float(lane.getLength())
+        via = lane.getOutgoing()[0].getViaLaneID()
+    return length_m

@@ -1,0 +1,102 @@
+"""The whole study: record, learn traits, train and test every policy, report."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import claim_folder
+from tint_sumo.dataset.recorder import record
+from tint_sumo.jobs import Job, Workers, executor_of
+from tint_sumo.methods.loading import shipped_policies
+from tint_sumo.methods.registry import Learned, find_learned, find_method, with_shared_trainings
+from tint_sumo.scenes import T_INTERSECTION, Scene, described, digest_of, find_scene
+from tint_sumo.study.budgets import Budget
+from tint_sumo.study.ceiling_job import CeilingJob
+from tint_sumo.study.folders import DATASET
+from tint_sumo.study.jobs import EvaluateJob, TrainJob
+from tint_sumo.study.page import write_page
+from tint_sumo.study.report import StudyReport, write_report
+from tint_sumo.study.trait_job import SEED, TraitJob
+
+
+def plan(budget: Budget, out: Path, scene: str | Scene = T_INTERSECTION) -> list[Job]:
+    """All jobs after the recording, those that hold up others or take longest first, one seed after the other."""
+    learned = [name for name in budget.methods if isinstance(find_method(name), Learned)]
+    rules = [name for name in budget.methods if name not in learned]
+    trained = with_shared_trainings(learned)
+    for name in trained:
+        find_learned(name).settings_of(budget.ppo)  # refuses what does not fit before hours of work
+    encoders = dict.fromkeys(filter(None, (find_learned(name).encoder for name in trained)))
+    traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
+    given = rules + (shipped_policies() if budget.with_shipped and scene == T_INTERSECTION else [])
+    trials = tuple(one.relative_to(find_scene(scene).tau_s) for one in budget.trials)
+    jobs: list[Job] = [*traits]
+    for seed in budget.seeds:
+        trainings = [
+            TrainJob(name, mix, seed, budget.ppo, budget.traits is None, out, scene)
+            for mix in budget.mixes
+            for name in trained
+        ]
+        jobs += sorted(trainings, key=lambda job: len(job.needs))
+        jobs += [EvaluateJob(name, mix, seed, trials, out, scene) for mix in budget.mixes for name in learned]
+    tests = [EvaluateJob(name, None, 0, trials, out, scene) for name in given]
+    return [*jobs, CeilingJob(trials, out, scene), *tests]
+
+
+def run_study(
+    budget: Budget, out: Path, *, scene: str | Scene = T_INTERSECTION, workers: Workers = 2, progress: bool = True
+) -> StudyReport:
+    """Run the study into ``out``; what an earlier, interrupted call has finished is not repeated.
+
+    Args:
+        budget: sizes of all stages.
+        out: a new folder, or the one of this very study.
+        scene: where everybody drives; the shipped policies, which know the paper's scene, are tested there alone.
+        workers: processes at a time, or an executor.
+        progress: show progress bars on stderr.
+
+    Raises:
+        InputError: ``out`` holds another run, the scene does not fit the budget, or a stage was refused.
+        JobError: jobs were given up; all others are done.
+    """
+    executor = executor_of(workers)
+    _require_traits(budget, require_scene("a study", scene))
+    jobs = plan(budget, out, scene)
+    place = {} if scene == T_INTERSECTION else described(scene)
+    with claim_folder(out, {"kind": "study", **asdict(budget), **place}):
+        if budget.traits is not None:
+            record(
+                out / DATASET,
+                budget.windows,
+                p_conservative=budget.record_p_conservative,
+                seed=SEED,
+                scene=scene,
+                workers=executor,
+                progress=progress,
+            )
+        executor.run(jobs, progress)
+        return write_page(write_report(out), out, workers=executor, progress=progress)
+
+
+def require_scene(work: str, scene: str | Scene) -> Scene:
+    """The scene, if this work, such as ``"a study"``, can be done there.
+
+    Raises:
+        InputError: it cannot.
+    """
+    found = find_scene(scene)
+    if not isinstance(found, Scene):
+        raise InputError(f"{work} needs a built-in scene, or one with other numbers, not {found.name}")
+    count = len(found.population.profiles)
+    if count != 2:
+        raise InputError(f"{work} is of two profiles of drivers, and scene {found.name} has {count}")
+    return found
+
+
+def _require_traits(budget: Budget, scene: Scene) -> None:
+    """Raise InputError unless the study has trait models for the scene."""
+    if budget.traits is None and scene.digest != digest_of(T_INTERSECTION):
+        raise InputError(
+            f"the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; give the budget traits, and "
+            "windows to learn them from, as the budget quick has"
+        )

@@ -1,0 +1,210 @@
+"""The rows of the results: all seeds of a method under the same conditions."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import groupby
+from typing import Any, TypeVar
+
+import numpy as np
+
+from tint_sumo.config import Share, ends
+from tint_sumo.core.statistics import Hits, Interval, rate_interval
+from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.methods.evaluation import Evaluation
+from tint_sumo.methods.registry import METHODS, Learned
+from tint_sumo.study.budgets import Conditions
+from tint_sumo.study.published import RATES_PERCENT
+from tint_sumo.study.results import GIVEN, Result
+
+WORLDS = {  # what can differ from the world of the training
+    "position_noise_m": "noise on positions (m)",
+    "tau_s": "headway tau of the drivers (s)",
+    "percent": "part of the training (%)",
+}
+
+
+@dataclass(frozen=True)
+class Summary(ABC):
+    """What tables, figures and files show of policies that differ by their training's seed alone."""
+
+    method: str
+    origin: str
+    mix: Share | None  # P(conservative) in training
+    conditions: Conditions
+    seeds: tuple[int, ...]
+    scene_tau_s: float  # headway of the scene's drivers
+
+    @property
+    def resolved(self) -> Conditions:
+        """The conditions with the scene's headway where none was given."""
+        return self.conditions.resolved(self.scene_tau_s)
+
+    @property
+    @abstractmethod
+    def episodes(self) -> int:
+        """Number of cases."""
+
+    @abstractmethod
+    def rate(self, outcome: str) -> float:
+        """Share of the cases with an outcome, over all seeds."""
+
+    @abstractmethod
+    def spread(self, outcome: str) -> float | None:
+        """Standard deviation between the seeds; None with one seed."""
+
+    @property
+    @abstractmethod
+    def intervals(self) -> Mapping[str, Interval]:
+        """95 % intervals of the outcomes: over seeds and cases, or over cases alone where there is one seed."""
+
+    @property
+    @abstractmethod
+    def navigation_time_s(self) -> float | None:
+        """Mean time of successful episodes; None without any."""
+
+    @property
+    def is_shipped(self) -> bool:
+        """Whether the package came with the policy."""
+        return self.origin == GIVEN and isinstance(METHODS.get(self.method), Learned)
+
+    @property
+    def title(self) -> str:
+        method = METHODS.get(self.method)
+        title = self.method if method is None else method.title
+        return f"{title} (shipped)" if self.is_shipped else title
+
+    @property
+    def published(self) -> dict[str, float]:
+        """The paper's rates in percent, empty where it has none; for its own conditions alone."""
+        if not self.conditions.is_single_mix:
+            return {}
+        low, _ = ends(self.conditions.p_conservative)
+        return dict(zip(OUTCOMES, RATES_PERCENT.get((self.method, low), ()), strict=False))
+
+
+@dataclass(frozen=True)
+class Row(Summary):
+    """The results of such policies in the same cases, case by case."""
+
+    evaluations: tuple[Evaluation, ...]  # one for each seed
+
+    @property
+    def episodes(self) -> int:
+        return len(self.evaluations[0].cases)
+
+    def hits(self, outcome: str) -> Hits:
+        """(seeds, cases): where there was an outcome."""
+        return np.array([[case.outcome == outcome for case in one.cases] for one in self.evaluations])
+
+    def rate(self, outcome: str) -> float:
+        return float(self.hits(outcome).mean())
+
+    def spread(self, outcome: str) -> float | None:
+        rates = self.hits(outcome).mean(axis=1)
+        return float(rates.std(ddof=1)) if len(rates) > 1 else None
+
+    @cached_property
+    def intervals(self) -> dict[str, Interval]:
+        if len(self.seeds) == 1:
+            return {outcome: self.evaluations[0].rate(outcome).interval for outcome in OUTCOMES}
+        return {outcome: rate_interval(self.hits(outcome)) for outcome in OUTCOMES}
+
+    @property
+    def navigation_time_s(self) -> float | None:
+        return self._pooled.navigation_time_s
+
+    @property
+    def collisions(self) -> dict[str, int]:
+        """Number of collisions by trait and route of the driver that was hit, over all seeds."""
+        return self._pooled.collisions
+
+    @property
+    def _pooled(self) -> Evaluation:
+        return Evaluation(tuple(case for one in self.evaluations for case in one.cases))
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "method": self.method,
+            "origin": self.origin,
+            "p_conservative": self.conditions.p_conservative,
+            "position_noise_m": self.conditions.position_noise_m,
+            "tau_s": self.resolved.tau_s,
+            "percent": self.conditions.percent,
+            "seeds": list(self.seeds),
+            "episodes": self.episodes,
+            **{outcome: self.rate(outcome) for outcome in OUTCOMES},
+            "intervals": {outcome: list(interval) for outcome, interval in self.intervals.items()},
+            "success_sd": self.spread("success"),
+            "navigation_time_s": self.navigation_time_s,
+            "collisions": self.collisions,
+            "published_percent": self.published or None,
+        }
+
+
+AnyRow = TypeVar("AnyRow", bound=Summary)
+
+
+def tabulate(results: Sequence[Result]) -> list[Row]:
+    """One row per conditions, origin, method and mix in training; methods in the registry's order."""
+    order = {name: position for position, name in enumerate(METHODS)}
+    flat = [(result, one) for result in results for one in result.tested]
+
+    def key(pair: tuple[Result, Any]) -> tuple[Any, ...]:
+        result, conditions = pair[0], pair[1].conditions
+        headway_s = 0.0 if conditions.tau_s is None else conditions.tau_s - result.scene_tau_s
+        return (
+            -conditions.percent,
+            conditions.position_noise_m,
+            abs(headway_s),  # the difference from the scene's
+            headway_s,
+            isinstance(conditions.p_conservative, tuple),
+            conditions.p_conservative,
+            order.get(result.method, len(order)),
+            result.method,
+            result.origin,
+            str(result.mix),
+        )
+
+    rows = []
+    for _, group in groupby(sorted(flat, key=key), key):
+        members = sorted(group, key=lambda pair: pair[0].seed)
+        first, tested = members[0]
+        seeds = tuple(result.seed for result, _ in members)
+        evaluations = tuple(one.evaluation for _, one in members)
+        rows.append(
+            Row(first.method, first.origin, first.mix, tested.conditions, seeds, first.scene_tau_s, evaluations)
+        )
+    return rows
+
+
+def at_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
+    """The rows of the main table: fully trained, the default world, one P(conservative) each."""
+    return [row for row in rows if row.conditions.is_single_mix]
+
+
+def over_all_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
+    """The rows of other worlds and parts of the training, where every case has a mix of its own."""
+    return [row for row in rows if isinstance(row.conditions.p_conservative, tuple)]
+
+
+def by_method(rows: Sequence[AnyRow]) -> list[AnyRow]:
+    """The rows in the registry's order, whatever the conditions; shipped policies come first."""
+    order = {name: position for position, name in enumerate(METHODS)}
+    return sorted(rows, key=lambda row: (order.get(row.method, len(order)), row.origin != GIVEN))
+
+
+def by_title(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
+    """The rows of each method, shipped policies apart, in the registry's order."""
+    found: dict[str, list[AnyRow]] = {}
+    for row in by_method(rows):
+        found.setdefault(row.title, []).append(row)
+    return found
+
+
+def varied(rows: Sequence[AnyRow], name: str) -> dict[float, AnyRow]:
+    """The rows that differ from the world of the training in at most one condition, by its values in their order."""
+    base = Conditions(rows[0].conditions.p_conservative)
+    shown = [row for row in rows if replace(row.conditions, **{name: getattr(base, name)}) == base]
+    return dict(sorted(((getattr(row.resolved, name), row) for row in shown), key=lambda pair: pair[0]))

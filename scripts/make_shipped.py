@@ -3,7 +3,7 @@
     .venv/bin/python scripts/make_shipped.py WORK_FOLDER
     .venv/bin/python scripts/make_shipped.py --pictures
 
-Takes about three hours on two cores. With --pictures it takes a minute, and draws the pictures that follow from the
+Takes about four hours on two cores. With --pictures it takes a minute, and draws the pictures that follow from the
 shipped policies and from the tables in data/results. The commands it runs are those of data/README.md.
 """
 
@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pandas
 import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
@@ -21,6 +22,7 @@ from PIL import Image, ImageDraw, ImageFont
 from tint_sumo import ENV_IDS
 from tint_sumo.cli import main as tint_sumo
 from tint_sumo.comparisons.traits import TraitStudy
+from tint_sumo.comparisons.traits_report import plot_noise
 from tint_sumo.core.files import write_json
 from tint_sumo.envs import SceneEnv
 from tint_sumo.methods.registry import Learned, find_method
@@ -42,6 +44,7 @@ from tint_sumo.traits.storage import add_to_card
 TITLE_PX = 26
 CLEAR_M = 0.8
 DATA = Path(__file__).resolve().parents[1] / "data"
+IMAGES = DATA / "images"
 SHIPPED_TRAITS = {"vae": 0.0, "cross_window": 0.05, "morton": 0.0, "classifier": 0.0}  # and the noise in training, m
 
 
@@ -57,7 +60,6 @@ def make_traits(work: Path) -> None:
     run("traits", "study", "--out", str(study))
     for name in ("traits.csv", "traits.md", "traits_seeds.csv", "traits_continuous.csv"):
         copy(study / name, DATA / "results" / name)
-    copy(study / "traits.png", DATA / "images" / "traits.png")
     for method, noise_m in SHIPPED_TRAITS.items():
         model = DATA / "models" / f"{method}.safetensors"
         trained = study / "models" / f"{method}-noise{noise_m:g}-seed0"
@@ -67,9 +69,9 @@ def make_traits(work: Path) -> None:
         accuracy = {f"{noise:g}": evaluate_traits(Path(dataset), model, noise_m=noise)["accuracy"] for noise in noises}
         add_to_card(model, {"accuracy_by_noise": accuracy})  # in m; the linear classifier is fitted to each noise
         run("traits", "plot", "--data", dataset, "--model", str(model), "--noise", f"{noise_m}", "--out", str(work))
-        copy(work / "latent.png", DATA / "images" / f"latent_{method}.png")
+        copy(work / "latent.png", IMAGES / f"latent_{method}.png")
     run("traits", "plot", "--data", dataset, "--model", "vae", "--out", str(work))
-    copy(work / "reconstruction.png", DATA / "images" / "reconstruction.png")
+    copy(work / "reconstruction.png", IMAGES / "reconstruction.png")
 
 
 def make_scenes(work: Path) -> None:
@@ -81,17 +83,11 @@ def make_scenes(work: Path) -> None:
 
 
 def make_policies(work: Path) -> None:
-    """The navigation study: its tables and figures, and the policy of each method with the first seed."""
+    """The navigation study: its tables, and the policy of each method with the first seed."""
     study = work / "navigation"
     run("study", "run", "--budget", "full", "--out", str(study))
     for suffix in (".csv", ".md"):
         copy(study / f"results{suffix}", DATA / "results" / f"navigation{suffix}")
-    for source, target in (
-        ("results.png", "navigation.png"),
-        ("worlds.png", "worlds.png"),
-        ("curves.png", "curves.png"),
-    ):
-        copy(study / source, DATA / "images" / target)
     rows = [row.to_json() for row in at_mixes(tabulate(read_results(study)))]
     budget = BUDGETS["full"]
     for name in budget.methods:
@@ -115,17 +111,18 @@ def copy(source: Path, target: Path) -> None:
     shutil.copyfile(source, target)
 
 
-def make_figures() -> None:
-    """The navigation study's figures, from its shipped table."""
+def make_figures(images: Path) -> None:
+    """Draw the figures of the navigation study and of the comparison of trait methods, from their shipped tables."""
     rows, _ = read_csv(DATA / "results" / "navigation.csv")
-    plot_bars(at_mixes(rows), DATA / "images" / "navigation.png")
-    plot_worlds(over_all_mixes(rows), DATA / "images" / "worlds.png")
+    plot_bars(at_mixes(rows), images / "navigation.png")
+    plot_worlds(over_all_mixes(rows), images / "worlds.png")
+    plot_noise(pandas.read_csv(DATA / "results" / "traits.csv"), images / "traits.png")
 
 
-def make_pictures() -> None:
-    """The paper's scene, and all scenes side by side, each with its name."""
+def make_pictures(images: Path) -> None:
+    """Draw the paper's scene, and all scenes side by side, each with its name."""
     pictures = {name: picture_of(name) for name in ENV_IDS}
-    Image.fromarray(pictures[T_INTERSECTION]).save(DATA / "images" / "scene.png", optimize=True)
+    Image.fromarray(pictures[T_INTERSECTION]).save(images / "scene.png", optimize=True)
     titled = [titled_picture(name, picture) for name, picture in pictures.items()]
     rows = [titled[:3], titled[3:]]
     width, heights = titled[0].width + 8, [max(one.height for one in row) + 8 for row in rows]
@@ -133,7 +130,7 @@ def make_pictures() -> None:
     for number, row in enumerate(rows):
         for column, one in enumerate(row):
             sheet.paste(one, (column * width, sum(heights[:number])))
-    sheet.save(DATA / "images" / "scenes.png", optimize=True)
+    sheet.save(images / "scenes.png", optimize=True)
 
 
 def titled_picture(name: str, picture: NDArray[np.uint8]) -> Image.Image:
@@ -184,7 +181,7 @@ def is_clear_in_traffic(simulation: Simulation | OwnSimulation) -> bool:
 def make_films() -> None:
     """A case that a shipped policy drives, as a film and as a strip."""
     for name in ("case.gif", "strip.png"):
-        film = str(DATA / "images" / name)
+        film = str(IMAGES / name)
         run("render", "--model", "cross_window", "--p-conservative", "0.4", "--case", "1", "--out", film)
 
 
@@ -193,12 +190,13 @@ if __name__ == "__main__":
         sys.exit(__doc__)
     torch.set_num_threads(1)  # the networks are small
     if sys.argv[1] == "--pictures":
-        make_figures()
-        make_pictures()
+        make_figures(IMAGES)
+        make_pictures(IMAGES)
         make_films()
         sys.exit()
-    make_pictures()
+    make_pictures(IMAGES)
     make_traits(Path(sys.argv[1]))
     make_policies(Path(sys.argv[1]))
+    make_figures(IMAGES)
     make_films()
     make_scenes(Path(sys.argv[1]))

@@ -1,4 +1,4 @@
-"""The pictures of scenes that are shipped: what ``scripts/make_shipped.py`` takes for a moment to show."""
+"""The pictures that are shipped: ``scripts/make_shipped.py`` draws them again as they are, and shows a good moment."""
 
 import sys
 from pathlib import Path
@@ -6,10 +6,12 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tint_sumo.envs import SceneEnv
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
+ROOT = Path(__file__).parents[1]
+SCRIPTS, IMAGES = ROOT / "scripts", ROOT / "data" / "images"
 
 
 @pytest.fixture
@@ -18,6 +20,29 @@ def make_shipped(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     import make_shipped  # type: ignore[import-not-found]
 
     return make_shipped
+
+
+def test_figures_are_drawn_from_the_shipped_tables(make_shipped: ModuleType, tmp_path: Path) -> None:
+    make_shipped.make_figures(tmp_path)
+    assert_pictures_are_shipped(tmp_path, {"navigation.png", "worlds.png", "traits.png"})
+
+
+@pytest.mark.long
+def test_pictures_of_scenes_are_those_of_their_episodes(make_shipped: ModuleType, tmp_path: Path) -> None:
+    make_shipped.make_pictures(tmp_path)
+    assert_pictures_are_shipped(tmp_path, {"scene.png", "scenes.png"})
+
+
+def assert_pictures_are_shipped(folder: Path, names: set[str]) -> None:
+    """Compare pictures in a folder with those in data/images, but for the edges of letters, which fonts decide."""
+    assert {file.name for file in folder.iterdir()} == names
+    for name in names:
+        drawn, shipped = (
+            np.asarray(Image.open(file).convert("RGB").reduce(4), int) for file in (folder / name, IMAGES / name)
+        )
+        assert drawn.shape == shipped.shape, name
+        differs = (np.abs(drawn - shipped) > 40).any(axis=-1)
+        assert differs.mean() < 0.01, name
 
 
 def test_an_ego_is_shown_among_the_traffic_and_clear_of_it(make_shipped: ModuleType) -> None:

@@ -31,7 +31,7 @@ from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.scenes.geometry import pose_distance_m
 from tint_sumo.simulation.simulation import Simulation
-from tint_sumo.simulation.sumocfg import OwnSimulation
+from tint_sumo.simulation.sumocfg import SumocfgSimulation
 from tint_sumo.study.budgets import BUDGETS
 from tint_sumo.study.figures import plot_bars, plot_worlds
 from tint_sumo.study.jobs import label
@@ -167,7 +167,7 @@ def picture_of(scene: str) -> NDArray[np.uint8]:
     return shown[len(shown) // 2]
 
 
-def is_clear_in_traffic(simulation: Simulation | OwnSimulation) -> bool:
+def is_clear_in_traffic(simulation: Simulation | SumocfgSimulation) -> bool:
     """Whether the ego claims a lane and all vehicles are as far from it as its safety check asks, or farther."""
     assert isinstance(simulation, Simulation)
     slots, shape = simulation.slots, simulation.scene.vehicle

@@ -11,7 +11,7 @@ import torch
 from hypothesis import settings
 
 from tests.s3 import empty_bucket, s3_server
-from tests.scenes.networks import OWN_NETWORKS, OwnNetwork
+from tests.scenes.networks import USER_NETWORKS, UserNetwork
 from tint_sumo import traits
 from tint_sumo.config import PolicySettings, PpoSettings, TraitSettings
 from tint_sumo.traits.storage import save
@@ -38,13 +38,13 @@ def _logs_in_a_folder_of_the_tests(tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.fixture(scope="session")
-def own_network(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], OwnNetwork]:
-    """Makes a network of one's own by its name, once."""
-    made: dict[str, OwnNetwork] = {}
+def user_network(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], UserNetwork]:
+    """Return a function that makes a user's network by its name, once."""
+    made: dict[str, UserNetwork] = {}
 
-    def make(name: str) -> OwnNetwork:
+    def make(name: str) -> UserNetwork:
         if name not in made:
-            made[name] = OWN_NETWORKS[name](tmp_path_factory.mktemp(name))
+            made[name] = USER_NETWORKS[name](tmp_path_factory.mktemp(name))
         return made[name]
 
     return make

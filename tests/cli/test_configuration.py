@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.scenes.networks import OwnNetwork
+from tests.scenes.networks import UserNetwork
 from tint_sumo.cli.command_line import TintSumo, main, parse
 from tint_sumo.cli.configuration import commands_named, subcommands
 from tint_sumo.core.errors import InputError
@@ -326,13 +326,13 @@ def test_policies_and_films_of_other_drivers(
 
 
 def test_a_sumo_configuration_as_a_scene(
-    own_network: Callable[[str], OwnNetwork],
+    user_network: Callable[[str], UserNetwork],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    merge = own_network("merge")
+    merge = user_network("merge")
     scene = (
         f"scene:\n  sumocfg: {merge.sumocfg}\n  ego_route: [ramp, out]\n  start_m: 20\n  goal_m: 130\n"
         "  warm_up_s: 1\n  time_limit_s: 1\n"

@@ -30,7 +30,7 @@ from tint_sumo.core.structures import FieldError, build, plain
 from tint_sumo.scenes import SCENES, find_scene, read_scene
 from tint_sumo.scenes.drivers import members
 from tint_sumo.scenes.scene import Scene
-from tint_sumo.scenes.settings import OwnSceneSettings, SceneSettings
+from tint_sumo.scenes.settings import SceneSettings, SumocfgSettings
 from tint_sumo.study.budgets import BUDGETS, Budget, Conditions, Trials
 
 SETTINGS: tuple[Any, ...] = (
@@ -83,7 +83,7 @@ def commands(kind: type) -> list[type]:
     return [kind] if not below else [one for group in below.values() for one in commands(group)]
 
 
-KINDS = [*(type(base) for base in SETTINGS), Scene, OwnSceneSettings, DriverProfile, Budget, *commands(TintSumo)]
+KINDS = [*(type(base) for base in SETTINGS), Scene, SumocfgSettings, DriverProfile, Budget, *commands(TintSumo)]
 
 
 @pytest.mark.parametrize("kind", dict.fromkeys(KINDS), ids=lambda kind: kind.__name__)

@@ -1,4 +1,4 @@
-"""Recording a SUMO configuration of one's own, and learning from that."""
+"""Recording a SUMO configuration, and learning from that."""
 
 import json
 import shutil
@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from tests.dataset.test_recorder import contents
-from tests.scenes.networks import OWN_NETWORKS, OwnNetwork, write_config
+from tests.scenes.networks import USER_NETWORKS, UserNetwork, write_config
 from tint_sumo.cli import main
 from tint_sumo.config import TraitSettings
 from tint_sumo.core.errors import InputError
@@ -21,22 +21,22 @@ from tint_sumo.dataset.sumocfg_recorder import EPISODES_PER_SHARD, record_sumocf
 from tint_sumo.dataset.windows import load_labels, load_windows
 from tint_sumo.traits.datasets import evaluate_traits, plot_traits, train_traits
 
-Make = Callable[[str], OwnNetwork]
+Make = Callable[[str], UserNetwork]
 TWO_SHARDS = 2000
 TINY = TraitSettings((8,), 8, 8, 8, epochs=1)
 
 
 @pytest.fixture(scope="module")
-def merge_data(own_network: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def merge_data(user_network: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two shards."""
     folder = tmp_path_factory.mktemp("merge_data")
-    record_sumocfg(own_network("merge").sumocfg, folder, TWO_SHARDS, progress=False)
+    record_sumocfg(user_network("merge").sumocfg, folder, TWO_SHARDS, progress=False)
     return folder
 
 
-@pytest.mark.parametrize("name", OWN_NETWORKS)
-def test_every_network_is_recorded_in_steps_of_windows(name: str, own_network: Make, tmp_path: Path) -> None:
-    network = own_network(name)
+@pytest.mark.parametrize("name", USER_NETWORKS)
+def test_every_network_is_recorded_in_steps_of_windows(name: str, user_network: Make, tmp_path: Path) -> None:
+    network = user_network(name)
     manifest = record_sumocfg(network.sumocfg, tmp_path / "d", 100, progress=False)
     rows = pd.read_parquet(tmp_path / "d" / TRAJECTORIES)
     drivers = pd.read_parquet(tmp_path / "d" / DRIVERS)
@@ -90,9 +90,9 @@ def test_leaders_drive_ahead_by_the_gap(merge_data: Path) -> None:
 
 
 def test_the_dataset_is_the_same_with_workers_and_after_an_interruption(
-    merge_data: Path, own_network: Make, tmp_path: Path
+    merge_data: Path, user_network: Make, tmp_path: Path
 ) -> None:
-    sumocfg = own_network("merge").sumocfg
+    sumocfg = user_network("merge").sumocfg
     record_sumocfg(sumocfg, tmp_path / "workers", TWO_SHARDS, workers=2, progress=False)
     assert contents(tmp_path / "workers") == contents(merge_data)
     interrupted = Path(shutil.copytree(merge_data, tmp_path / "interrupted"))
@@ -104,8 +104,8 @@ def test_the_dataset_is_the_same_with_workers_and_after_an_interruption(
     assert manifest["shards"] == 2
 
 
-def test_a_vehicle_that_sumo_teleports_appears_anew(own_network: Make, tmp_path: Path) -> None:
-    merge = own_network("merge")
+def test_a_vehicle_that_sumo_teleports_appears_anew(user_network: Make, tmp_path: Path) -> None:
+    merge = user_network("merge")
     (merge.sumocfg.parent / "jam.rou.xml").write_text(
         '<routes><vehicle id="first" depart="0" departPos="90"><route edges="ramp out"/>'
         '<stop lane="ramp_0" endPos="90" duration="1000"/></vehicle>'
@@ -120,8 +120,8 @@ def test_a_vehicle_that_sumo_teleports_appears_anew(own_network: Make, tmp_path:
     assert first.groupby("vehicle")["position_m"].diff().max() < 2.0
 
 
-def test_a_folder_is_of_one_configuration_and_seed(merge_data: Path, own_network: Make, tmp_path: Path) -> None:
-    network = own_network("merge")
+def test_a_folder_is_of_one_configuration_and_seed(merge_data: Path, user_network: Make, tmp_path: Path) -> None:
+    network = user_network("merge")
     with pytest.raises(InputError, match="different: seed"):
         record_sumocfg(network.sumocfg, merge_data, TWO_SHARDS, seed=1, progress=False)
     folder = Path(shutil.copytree(network.sumocfg.parent, tmp_path / "merge"))
@@ -143,8 +143,8 @@ def test_a_trait_model_learns_from_it(merge_data: Path, tmp_path: Path) -> None:
         plot_traits(merge_data, tmp_path / "vae", tmp_path / "pictures")
 
 
-def test_the_classifier_needs_two_vtypes(own_network: Make, tmp_path: Path) -> None:
-    record_sumocfg(own_network("braunschweig").sumocfg, tmp_path / "d", 100, progress=False)
+def test_the_classifier_needs_two_vtypes(user_network: Make, tmp_path: Path) -> None:
+    record_sumocfg(user_network("braunschweig").sumocfg, tmp_path / "d", 100, progress=False)
     with pytest.raises(InputError, match="two kinds of drivers apart, and these windows have 3; choose"):
         train_traits(tmp_path / "d", tmp_path / "c", method="classifier", settings=TINY)
     assert not (tmp_path / "c").exists()
@@ -183,9 +183,9 @@ def test_the_figure_of_many_vtypes_names_those_that_drive_and_has_room_for_them(
     ],
 )
 def test_bad_input_is_told_in_one_line(
-    arguments: list[str], message: str, own_network: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], message: str, user_network: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    merge = own_network("merge")
+    merge = user_network("merge")
     others = {"merge": merge.sumocfg}
     for name, routes in (("empty", ""), ("wrong", '<vehicle id="a" depart="9"><route edges="nowhere"/></vehicle>')):
         (merge.sumocfg.parent / f"{name}.rou.xml").write_text(f"<routes>{routes}</routes>")

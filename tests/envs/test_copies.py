@@ -15,7 +15,7 @@ import pytest
 
 from tests.envs.test_resets import assert_same_answers
 from tests.envs.test_workers import assert_infos_equal
-from tests.scenes.networks import OwnNetwork
+from tests.scenes.networks import UserNetwork
 from tint_sumo import ENV_IDS, SCENE_ENV_ID
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv
@@ -46,12 +46,12 @@ def assert_all_same(first: list[tuple[Any, ...]], second: list[tuple[Any, ...]])
 @copies
 @pytest.mark.parametrize("scene", [T_INTERSECTION, "merge"])
 def test_a_copy_goes_on_like_the_original_which_does_not_notice(
-    copied: Copy, scene: str, own_network: Callable[[str], OwnNetwork]
+    copied: Copy, scene: str, user_network: Callable[[str], UserNetwork]
 ) -> None:
     """As planners use it: with the registered arguments, of the wrapped and of the bare environment."""
     task: dict[str, Any] = TASK
     if scene == "merge":
-        task = {"position_noise_m": 0.1, "time_limit_s": 6.0, "scene": own_network("merge").scene(warm_up_s=5.0)}
+        task = {"position_noise_m": 0.1, "time_limit_s": 6.0, "scene": user_network("merge").scene(warm_up_s=5.0)}
     with closing(gymnasium.make(ENV_IDS.get(scene, SCENE_ENV_ID), backend="libsumo", **task)) as env:
         env.reset(seed=3)
         for _ in range(20):

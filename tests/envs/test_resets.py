@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from tests.envs.test_workers import assert_infos_equal
-from tests.scenes.networks import OWN_NETWORKS, OwnNetwork
+from tests.scenes.networks import USER_NETWORKS, UserNetwork
 from tint_sumo.envs import SceneEnv, SceneVectorEnv
 from tint_sumo.envs.episodes import Episodes
 from tint_sumo.scenes import SCENES
 
 GO, STOP = 2, 0
 TASK: dict[str, Any] = {"tracks": True, "position_noise_m": 0.1, "time_limit_s": 30.0}
-Make = Callable[[str], OwnNetwork]
+Make = Callable[[str], UserNetwork]
 
 
 def state(episodes: Episodes) -> dict[str, Any]:
@@ -52,9 +52,9 @@ def actions(seed: int) -> Iterator[int]:
         yield STOP if seed == 0 else int(rng.choice([GO, GO, GO, 1, STOP]))
 
 
-@pytest.mark.parametrize("name", [*SCENES, *OWN_NETWORKS])
-def test_nothing_of_an_episode_is_left_after_a_reset(name: str, own_network: Make) -> None:
-    scene: Any = name if name in SCENES else own_network(name).scene(warm_up_s=5.0)
+@pytest.mark.parametrize("name", [*SCENES, *USER_NETWORKS])
+def test_nothing_of_an_episode_is_left_after_a_reset(name: str, user_network: Make) -> None:
+    scene: Any = name if name in SCENES else user_network(name).scene(warm_up_s=5.0)
     with closing(SceneEnv(scene, **TASK)) as env:
         fresh = env.reset(seed=7)
         fresh_state, snapshot = state(env._episodes), env.snapshot()
@@ -71,7 +71,7 @@ def test_nothing_of_an_episode_is_left_after_a_reset(name: str, own_network: Mak
             for again in (env.restore(snapshot), env.reset(seed=7)):
                 assert_same_answers(again, fresh)
             assert_same_state(state(env._episodes), fresh_state)
-    assert "timeout" in outcomes and (len(outcomes) > 1 or name in OWN_NETWORKS)
+    assert "timeout" in outcomes and (len(outcomes) > 1 or name in USER_NETWORKS)
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -1,4 +1,4 @@
-"""Environments of a SUMO configuration of one's own, and coming back to where an episode was."""
+"""Environments of SUMO configurations, and coming back to where an episode was."""
 
 import pickle
 from collections.abc import Callable, Iterator
@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from tests.envs.test_workers import assert_infos_equal
-from tests.scenes.networks import OWN_NETWORKS, OwnNetwork
+from tests.scenes.networks import USER_NETWORKS, UserNetwork
 from tint_sumo import SCENE_ENV_ID
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs.sb3 import SceneVecEnv
@@ -20,7 +20,7 @@ from tint_sumo.envs.scene_env import SceneEnv
 from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.scenes import T_INTERSECTION
 
-Make = Callable[[str], OwnNetwork]
+Make = Callable[[str], UserNetwork]
 STEPS = 100
 
 
@@ -47,9 +47,9 @@ def play(env: SceneEnv, seed: int, steps: int = STEPS) -> list[Any]:
     return [told(env.step(action)) for action in actions]
 
 
-@pytest.mark.parametrize("name", OWN_NETWORKS)
-def test_gymnasium_makes_and_checks_them(name: str, own_network: Make) -> None:
-    scene = own_network(name).scene(warm_up_s=5.0)
+@pytest.mark.parametrize("name", USER_NETWORKS)
+def test_gymnasium_makes_and_checks_them(name: str, user_network: Make) -> None:
+    scene = user_network(name).scene(warm_up_s=5.0)
     env = gymnasium.make(SCENE_ENV_ID, scene=scene, render_mode="rgb_array", tracks=True)
     try:
         check_env(env.unwrapped, skip_render_check=True)
@@ -68,8 +68,8 @@ def test_gymnasium_makes_and_checks_them(name: str, own_network: Make) -> None:
         env.close()
 
 
-def test_the_traits_are_the_numbers_of_the_vtypes(own_network: Make) -> None:
-    with made(own_network("merge").scene(), time_limit_s=20.0) as env:
+def test_the_traits_are_the_numbers_of_the_vtypes(user_network: Make) -> None:
+    with made(user_network("merge").scene(), time_limit_s=20.0) as env:
         seen = {int(trait) for trait in env.reset(seed=1)[1]["traits"]}
         for _ in range(199):
             observation, _, terminated, truncated, info = env.step(0)
@@ -84,8 +84,8 @@ def test_the_traits_are_the_numbers_of_the_vtypes(own_network: Make) -> None:
     assert seen == {-1, 0, 1}
 
 
-def test_a_vector_has_as_many_workers_as_environments(own_network: Make) -> None:
-    scene = own_network("merge").scene(warm_up_s=5.0)
+def test_a_vector_has_as_many_workers_as_environments(user_network: Make) -> None:
+    scene = user_network("merge").scene(warm_up_s=5.0)
     with pytest.raises(InputError, match="set workers to num_envs"):
         SceneVectorEnv(2, scene)
     with pytest.raises(InputError, match="set workers to num_envs"):
@@ -106,8 +106,8 @@ def test_a_vector_has_as_many_workers_as_environments(own_network: Make) -> None
                 assert env.step(action)[1] == reward[index]
 
 
-def test_stable_baselines_has_them_too(own_network: Make) -> None:
-    env = SceneVecEnv(1, seed=3, scene=own_network("merge").scene(warm_up_s=5.0), tracks=True)
+def test_stable_baselines_has_them_too(user_network: Make) -> None:
+    env = SceneVecEnv(1, seed=3, scene=user_network("merge").scene(warm_up_s=5.0), tracks=True)
     try:
         env.reset()
         for _ in range(20):
@@ -120,14 +120,14 @@ def test_stable_baselines_has_them_too(own_network: Make) -> None:
 
 
 @pytest.mark.parametrize("settings", [{"p_conservative": 0.5}, {"tau_s": 1.5}])
-def test_nobody_but_the_configuration_says_who_drives(settings: dict[str, float], own_network: Make) -> None:
+def test_nobody_but_the_configuration_says_who_drives(settings: dict[str, float], user_network: Make) -> None:
     with pytest.raises(InputError, match="leave p_conservative and tau_s out"):
-        SceneEnv(own_network("merge").scene(), **settings)
+        SceneEnv(user_network("merge").scene(), **settings)
 
 
-@pytest.mark.parametrize("name", [*OWN_NETWORKS, T_INTERSECTION])
-def test_an_episode_goes_on_from_a_snapshot_as_it_did(name: str, own_network: Make) -> None:
-    scene: Any = name if name == T_INTERSECTION else own_network(name).scene(warm_up_s=5.0)
+@pytest.mark.parametrize("name", [*USER_NETWORKS, T_INTERSECTION])
+def test_an_episode_goes_on_from_a_snapshot_as_it_did(name: str, user_network: Make) -> None:
+    scene: Any = name if name == T_INTERSECTION else user_network(name).scene(warm_up_s=5.0)
     with made(scene, position_noise_m=0.1, tracks=True, time_limit_s=500.0) as env:
         env.reset(seed=1)
         play(env, 0, 10)
@@ -147,10 +147,10 @@ def test_an_episode_goes_on_from_a_snapshot_as_it_did(name: str, own_network: Ma
 
 
 @pytest.mark.parametrize("kind", ["one process", "workers", "scenes", "own network"])
-def test_the_episodes_of_a_vector_go_on_from_a_snapshot_as_they_did(kind: str, own_network: Make) -> None:
+def test_the_episodes_of_a_vector_go_on_from_a_snapshot_as_they_did(kind: str, user_network: Make) -> None:
     task: dict[str, Any] = {"position_noise_m": 0.1, "tracks": True, "time_limit_s": 12.0}
     if kind == "own network":
-        task |= {"scene": [own_network("merge").scene(warm_up_s=5.0)] * 2}
+        task |= {"scene": [user_network("merge").scene(warm_up_s=5.0)] * 2}
     task |= {
         "workers": {"workers": 2, "autoreset_mode": "SameStep"},
         "scenes": {"scene": ["roundabout", T_INTERSECTION]},

@@ -14,7 +14,7 @@ from typing import Any
 import sumo
 
 from tint_sumo.config import EgoController
-from tint_sumo.scenes import OwnScene, from_sumocfg
+from tint_sumo.scenes import SumocfgScene, from_sumocfg
 from tint_sumo.scenes.network import sumo_program
 
 _SHIPPED = Path(sumo.SUMO_HOME) / "tools" / "game"
@@ -55,7 +55,7 @@ _MERGE_ROUTES = """<routes>
 
 
 @dataclass(frozen=True)
-class OwnNetwork:
+class UserNetwork:
     """A configuration and a task in it."""
 
     sumocfg: Path
@@ -64,7 +64,7 @@ class OwnNetwork:
     goal_m: float
     speeds_mps: tuple[float, ...] = (0.0, 0.5, 3.0)
 
-    def scene(self, **changes: Any) -> OwnScene:
+    def scene(self, **changes: Any) -> SumocfgScene:
         task: dict[str, Any] = {
             "ego_route": self.ego_route,
             "start_m": self.start_m,
@@ -75,25 +75,25 @@ class OwnNetwork:
         return from_sumocfg(self.sumocfg, **(task | changes))
 
 
-def braunschweig(_: Path) -> OwnNetwork:
-    return OwnNetwork(_SHIPPED / "fokr_bs_demo.sumocfg", ("-3", "-3.22", "1", "1.16"), 5.0, 100.0)
+def braunschweig(_: Path) -> UserNetwork:
+    return UserNetwork(_SHIPPED / "fokr_bs_demo.sumocfg", ("-3", "-3.22", "1", "1.16"), 5.0, 100.0)
 
 
-def autobahn(_: Path) -> OwnNetwork:
+def autobahn(_: Path) -> UserNetwork:
     route = ("4935288", "240042194#0", "308396219")
-    return OwnNetwork(_SHIPPED / "A10KW.sumocfg", route, 5.0, 300.0, (0.0, 5.0, 12.0))
+    return UserNetwork(_SHIPPED / "A10KW.sumocfg", route, 5.0, 300.0, (0.0, 5.0, 12.0))
 
 
-def grid(folder: Path) -> OwnNetwork:
+def grid(folder: Path) -> UserNetwork:
     """Four crossings by four with two lanes per direction, in SUMO's default steps of a second."""
     options = "--grid --grid.x-number 3 --grid.y-number 3 --grid.length 80 --grid.attach-length 60 -L 2"
     _run("netgenerate", *options.split(), "-o", str(folder / "grid.net.xml"))
     (folder / "grid.rou.xml").write_text(_GRID_ROUTES)
     sumocfg = write_config(folder / "grid.sumocfg", "grid.net.xml", "grid.rou.xml")
-    return OwnNetwork(sumocfg, ("bottom2C0", "C0C1", "C1B1", "B1A1"), 10.0, 150.0)
+    return UserNetwork(sumocfg, ("bottom2C0", "C0C1", "C1B1", "B1A1"), 10.0, 150.0)
 
 
-def merge(folder: Path) -> OwnNetwork:
+def merge(folder: Path) -> UserNetwork:
     (folder / "merge.nod.xml").write_text(_MERGE_NODES)
     (folder / "merge.edg.xml").write_text(_MERGE_EDGES)
     files = ("-n", str(folder / "merge.nod.xml"), "-e", str(folder / "merge.edg.xml"))
@@ -101,10 +101,10 @@ def merge(folder: Path) -> OwnNetwork:
     (folder / "merge.rou.xml").write_text(_MERGE_ROUTES)
     step = '<step-length value="0.1"/>'
     sumocfg = write_config(folder / "merge.sumocfg", "merge.net.xml", "merge.rou.xml", step)
-    return OwnNetwork(sumocfg, ("ramp", "out"), 20.0, 130.0)
+    return UserNetwork(sumocfg, ("ramp", "out"), 20.0, 130.0)
 
 
-OWN_NETWORKS: dict[str, Callable[[Path], OwnNetwork]] = {
+USER_NETWORKS: dict[str, Callable[[Path], UserNetwork]] = {
     one.__name__: one for one in (braunschweig, autobahn, grid, merge)
 }
 

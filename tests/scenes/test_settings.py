@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tests.scenes.networks import OwnNetwork
+from tests.scenes.networks import UserNetwork
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DRIVER_PROFILES, POPULATIONS, Population, read_population
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.structures import plain
@@ -84,8 +84,8 @@ def test_a_card_tells_all_of_a_changed_scene() -> None:
     assert read_described(described(ALL_SCENES)) == ALL_SCENES
 
 
-def test_a_sumo_configuration(own_network: Callable[[str], OwnNetwork]) -> None:
-    merge = own_network("merge")
+def test_a_sumo_configuration(user_network: Callable[[str], UserNetwork]) -> None:
+    merge = user_network("merge")
     task = {"ego_route": list(merge.ego_route), "start_m": 20, "goal_m": 130, "warm_up_s": 20}
     scene = read_scene({"sumocfg": str(merge.sumocfg), **task})
     assert scene == merge.scene()

@@ -1,4 +1,4 @@
-"""Scenes of a SUMO configuration of one's own, as far as no simulation is needed."""
+"""Scenes from SUMO configurations, as far as no simulation is needed."""
 
 import pickle
 import re
@@ -10,26 +10,26 @@ from pathlib import Path
 
 import pytest
 
-from tests.scenes.networks import OWN_NETWORKS, OwnNetwork, write_config
+from tests.scenes.networks import USER_NETWORKS, UserNetwork, write_config
 from tint_sumo.core.errors import InputError
-from tint_sumo.scenes import OwnScene
+from tint_sumo.scenes import SumocfgScene
 from tint_sumo.scenes.network import sumo_program
 from tint_sumo.scenes.sumocfg import MOST_VTYPES, NET_VERSION, read_config, read_net, read_vtypes
 
-Make = Callable[[str], OwnNetwork]
+Make = Callable[[str], UserNetwork]
 
 
 @pytest.fixture
-def merge(own_network: Make, tmp_path: Path) -> OwnNetwork:
+def merge(user_network: Make, tmp_path: Path) -> UserNetwork:
     """A copy that may be damaged."""
-    network = own_network("merge")
+    network = user_network("merge")
     folder = Path(shutil.copytree(network.sumocfg.parent, tmp_path / "merge"))
     return replace(network, sumocfg=folder / network.sumocfg.name)
 
 
-@pytest.mark.parametrize("name", OWN_NETWORKS)
-def test_scenes_know_their_drivers_and_can_be_sent_to_other_processes(name: str, own_network: Make) -> None:
-    scene = own_network(name).scene()
+@pytest.mark.parametrize("name", USER_NETWORKS)
+def test_scenes_know_their_drivers_and_can_be_sent_to_other_processes(name: str, user_network: Make) -> None:
+    scene = user_network(name).scene()
     vtypes = {
         "braunschweig": ("bike_bicycle", "veh_bus", "veh_car", "veh_motorbike", "veh_truck", "veh_van"),
         "grid": ("DEFAULT_VEHTYPE", "lorry"),
@@ -38,10 +38,10 @@ def test_scenes_know_their_drivers_and_can_be_sent_to_other_processes(name: str,
     assert scene.vtypes == vtypes.get(name, scene.vtypes)
     assert scene.step_s == {"braunschweig": 0.05, "autobahn": 0.5, "grid": 1.0, "merge": 0.1}[name]
     assert pickle.loads(pickle.dumps(scene)) == scene
-    assert hash(scene) == hash(own_network(name).scene())
+    assert hash(scene) == hash(user_network(name).scene())
 
 
-def test_the_ego_departs_where_it_starts_on_its_route(merge: OwnNetwork) -> None:
+def test_the_ego_departs_where_it_starts_on_its_route(merge: UserNetwork) -> None:
     scene = merge.scene()
     assert scene.departure == (("ramp", "out"), 20.0)
     start_m = scene.route_edge_start_m[1]
@@ -50,9 +50,9 @@ def test_the_ego_departs_where_it_starts_on_its_route(merge: OwnNetwork) -> None
     assert later.departure[1] == pytest.approx(5.0)
 
 
-def test_long_steps_do_not_make_the_ego_overshoot(own_network: Make) -> None:
-    assert own_network("grid").scene().ego.controller.gain_per_s == 1.0
-    assert own_network("merge").scene().ego.controller.gain_per_s == 2.0
+def test_long_steps_do_not_make_the_ego_overshoot(user_network: Make) -> None:
+    assert user_network("grid").scene().ego.controller.gain_per_s == 1.0
+    assert user_network("merge").scene().ego.controller.gain_per_s == 2.0
 
 
 @pytest.mark.parametrize(
@@ -69,19 +69,19 @@ def test_long_steps_do_not_make_the_ego_overshoot(own_network: Make) -> None:
         ({"warm_up_s": -1.0}, "warm_up_s must lie in"),
     ],
 )
-def test_bad_tasks_are_refused(changes: dict[str, object], message: str, merge: OwnNetwork) -> None:
+def test_bad_tasks_are_refused(changes: dict[str, object], message: str, merge: UserNetwork) -> None:
     with pytest.raises(InputError, match=message) as caught:
         merge.scene(**changes)
     assert "\n" not in str(caught.value)
 
 
-def test_the_ego_may_not_start_on_a_junction(merge: OwnNetwork) -> None:
+def test_the_ego_may_not_start_on_a_junction(merge: UserNetwork) -> None:
     with pytest.raises(InputError, match=r"on a junction; its route's edges are at 0\.0 to"):
         merge.scene(start_m=merge.scene().route_edge_start_m[1] - 0.5)
 
 
-def test_a_route_may_not_lead_over_a_way_for_others(own_network: Make) -> None:
-    network = own_network("braunschweig")
+def test_a_route_may_not_lead_over_a_way_for_others(user_network: Make) -> None:
+    network = user_network("braunschweig")
     net = read_net(read_config(network.sumocfg).net_file)
     footway = next(edge.getID() for edge in net.getEdges() if not edge.allows("passenger"))
     with pytest.raises(InputError, match="closed to passenger cars"):
@@ -89,14 +89,14 @@ def test_a_route_may_not_lead_over_a_way_for_others(own_network: Make) -> None:
 
 
 @pytest.mark.parametrize("missing", ["merge.net.xml", "merge.rou.xml", "merge.sumocfg"])
-def test_missing_files_are_named(missing: str, merge: OwnNetwork) -> None:
+def test_missing_files_are_named(missing: str, merge: UserNetwork) -> None:
     (merge.sumocfg.parent / missing).unlink()
     with pytest.raises(InputError, match=missing):
         merge.scene()
 
 
 @pytest.mark.parametrize("damaged", ["merge.net.xml", "merge.rou.xml", "merge.sumocfg"])
-def test_damaged_files_are_named(damaged: str, merge: OwnNetwork) -> None:
+def test_damaged_files_are_named(damaged: str, merge: UserNetwork) -> None:
     file = merge.sumocfg.parent / damaged
     file.write_text(file.read_text()[:-30])
     with pytest.raises(InputError, match=damaged) as caught:
@@ -108,7 +108,7 @@ def test_damaged_files_are_named(damaged: str, merge: OwnNetwork) -> None:
     ("version", "message"),
     [('version="1.99"', "of a newer SUMO"), ("", "is not a SUMO network"), ('version="2.0"', "newer")],
 )
-def test_networks_of_a_newer_sumo_are_refused(version: str, message: str, merge: OwnNetwork) -> None:
+def test_networks_of_a_newer_sumo_are_refused(version: str, message: str, merge: UserNetwork) -> None:
     file = merge.sumocfg.parent / "merge.net.xml"
     file.write_text(re.sub(r'<net version="[0-9.]*"', f"<net {version}", file.read_text()))
     with pytest.raises(InputError, match=message):
@@ -121,14 +121,14 @@ def test_the_known_version_is_that_of_this_sumo(tmp_path: Path) -> None:
     assert tuple(map(int, read_net(file).getVersion())) == NET_VERSION
 
 
-def test_too_many_vtypes_are_refused(merge: OwnNetwork) -> None:
+def test_too_many_vtypes_are_refused(merge: UserNetwork) -> None:
     lines = "".join(f'<vType id="{number}"/>' for number in range(MOST_VTYPES + 1))
     (merge.sumocfg.parent / "merge.rou.xml").write_text(f"<routes>{lines}</routes>")
     with pytest.raises(InputError, match="128 vTypes; at most 127"):
         read_vtypes(read_config(merge.sumocfg))
 
 
-def test_configurations_are_read_in_all_their_forms(merge: OwnNetwork) -> None:
+def test_configurations_are_read_in_all_their_forms(merge: UserNetwork) -> None:
     folder = merge.sumocfg.parent
     short = folder / "short.sumocfg"
     short.write_text(
@@ -146,4 +146,4 @@ def test_configurations_are_read_in_all_their_forms(merge: OwnNetwork) -> None:
 
 
 def test_defaults_are_those_of_the_built_in_scenes() -> None:
-    assert (OwnScene.max_vehicles, OwnScene.time_limit_s) == (12, 50.0)
+    assert (SumocfgScene.max_vehicles, SumocfgScene.time_limit_s) == (12, 50.0)

@@ -10,11 +10,11 @@ import libsumo
 import pytest
 from traci.storage import Storage
 
-from tests.scenes.networks import OwnNetwork
+from tests.scenes.networks import UserNetwork
 from tests.simulation.scenes import T
 from tint_sumo.core.errors import InputError
 from tint_sumo.simulation.simulation import Simulation
-from tint_sumo.simulation.sumocfg import OwnSimulation, sumo_options
+from tint_sumo.simulation.sumocfg import SumocfgSimulation, sumo_options
 
 
 def test_a_second_simulation_in_the_process_takes_traci_and_libsumo_comes_back() -> None:
@@ -46,11 +46,11 @@ def test_half_an_answer_that_an_interrupt_has_left_does_not_keep_traci_from_clos
 
 
 @pytest.fixture
-def start_as_user(own_network: Callable[[str], OwnNetwork]) -> Iterator[Callable[[], None]]:
+def start_as_user(user_network: Callable[[str], UserNetwork]) -> Iterator[Callable[[], None]]:
     """Start a simulation in libsumo as the user's own program does, and step it once."""
 
     def start() -> None:
-        libsumo.start(["sumo", *sumo_options(own_network("merge").scene().config, seed=5)])
+        libsumo.start(["sumo", *sumo_options(user_network("merge").scene().config, seed=5)])
         libsumo.simulationStep(10.0)
 
     yield start
@@ -70,7 +70,7 @@ def test_where_the_user_runs_libsumo_simulations_take_traci(start_as_user: Calla
 
 
 def test_closing_never_ends_a_simulation_that_the_user_started_later(
-    start_as_user: Callable[[], None], own_network: Callable[[str], OwnNetwork]
+    start_as_user: Callable[[], None], user_network: Callable[[str], UserNetwork]
 ) -> None:
     closed = Simulation(1, T)
     closed.close()
@@ -78,7 +78,7 @@ def test_closing_never_ends_a_simulation_that_the_user_started_later(
     closed.close()
     del closed
     libsumo.close()
-    for make in (lambda: Simulation(1, T), lambda: OwnSimulation(own_network("merge").scene())):
+    for make in (lambda: Simulation(1, T), lambda: SumocfgSimulation(user_network("merge").scene())):
         running = make()
         assert running.backend == "libsumo"
         start_as_user()  # libsumo ends the one that runs
@@ -87,8 +87,8 @@ def test_closing_never_ends_a_simulation_that_the_user_started_later(
         libsumo.close()
 
 
-def test_libsumo_is_free_after_episodes_of_a_configuration(own_network: Callable[[str], OwnNetwork]) -> None:
-    simulation = OwnSimulation(own_network("merge").scene(warm_up_s=0.0), backend="libsumo")
+def test_libsumo_is_free_after_episodes_of_a_configuration(user_network: Callable[[str], UserNetwork]) -> None:
+    simulation = SumocfgSimulation(user_network("merge").scene(warm_up_s=0.0), backend="libsumo")
     simulation.reset(0, 1)
     simulation.close()
     assert not libsumo.isLoaded()

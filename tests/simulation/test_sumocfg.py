@@ -1,4 +1,4 @@
-"""The simulation of a SUMO configuration of one's own."""
+"""The simulation of a SUMO configuration."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -10,18 +10,18 @@ import pytest
 import shapely
 from shapely.affinity import rotate, translate
 
-from tests.scenes.networks import OWN_NETWORKS, OwnNetwork, write_config
+from tests.scenes.networks import USER_NETWORKS, UserNetwork, write_config
 from tint_sumo.config import Backend, EgoController
 from tint_sumo.core.errors import InputError
-from tint_sumo.scenes import OwnScene
-from tint_sumo.simulation.sumocfg import EGO, OwnSimulation, make_simulation
+from tint_sumo.scenes import SumocfgScene
+from tint_sumo.simulation.sumocfg import EGO, SumocfgSimulation, make_simulation
 
-Make = Callable[[str], OwnNetwork]
+Make = Callable[[str], UserNetwork]
 
 
 @contextmanager
-def begun(scene: OwnScene, seed: int = 1, backend: Backend = "auto") -> Iterator[OwnSimulation]:
-    simulation = OwnSimulation(scene, backend)
+def begun(scene: SumocfgScene, seed: int = 1, backend: Backend = "auto") -> Iterator[SumocfgSimulation]:
+    simulation = SumocfgSimulation(scene, backend)
     try:
         simulation.reset(0, seed)
         yield simulation
@@ -29,7 +29,7 @@ def begun(scene: OwnScene, seed: int = 1, backend: Backend = "auto") -> Iterator
         simulation.close()
 
 
-def drive(simulation: OwnSimulation, steps: int, desired_mps: float | None = None) -> Iterator[int]:
+def drive(simulation: SumocfgSimulation, steps: int, desired_mps: float | None = None) -> Iterator[int]:
     """Steps at the top speed, or another, until the ego has arrived or had a collision."""
     scene = simulation.scene
     desired = np.array([scene.controller.desired_speeds_mps[-1] if desired_mps is None else desired_mps])
@@ -40,9 +40,9 @@ def drive(simulation: OwnSimulation, steps: int, desired_mps: float | None = Non
             return
 
 
-def test_the_ego_reaches_its_goal_in_every_network(own_network: Make) -> None:
-    for name in OWN_NETWORKS:
-        scene = own_network(name).scene()
+def test_the_ego_reaches_its_goal_in_every_network(user_network: Make) -> None:
+    for name in USER_NETWORKS:
+        scene = user_network(name).scene()
         front_m = []
         with begun(scene, seed=4) as simulation:
             egos = simulation.egos
@@ -57,9 +57,9 @@ def test_the_ego_reaches_its_goal_in_every_network(own_network: Make) -> None:
 
 
 @pytest.mark.parametrize("name", ["braunschweig", "merge"])
-def test_slots_hold_the_nearest_vehicles_and_rest_between_two(name: str, own_network: Make) -> None:
+def test_slots_hold_the_nearest_vehicles_and_rest_between_two(name: str, user_network: Make) -> None:
     sight_m = {"braunschweig": 60.0, "merge": 30.0}[name]
-    scene = own_network(name).scene(max_vehicles=3, sight_m=sight_m)
+    scene = user_network(name).scene(max_vehicles=3, sight_m=sight_m)
     with begun(scene) as simulation:
         slots, vehicle = simulation.slots, simulation.connection.vehicle
         before = slots.vehicle_number[0].copy()
@@ -82,8 +82,8 @@ def test_slots_hold_the_nearest_vehicles_and_rest_between_two(name: str, own_net
         assert crowds > 10
 
 
-def test_distances_are_those_of_boxes_of_each_vehicles_size(own_network: Make) -> None:
-    scene = own_network("braunschweig").scene()
+def test_distances_are_those_of_boxes_of_each_vehicles_size(user_network: Make) -> None:
+    scene = user_network("braunschweig").scene()
     with begun(scene) as simulation:
         slots, egos = simulation.slots, simulation.egos
         seen = set()
@@ -104,9 +104,9 @@ def _box(pose: np.void, length_m: float, width_m: float) -> shapely.Polygon:
     return translate(rotate(box, angle_rad, origin=(0, 0), use_radians=True), pose["x_m"], pose["y_m"])
 
 
-def test_touching_a_vehicle_is_a_collision_with_its_vtype(own_network: Make) -> None:
+def test_touching_a_vehicle_is_a_collision_with_its_vtype(user_network: Make) -> None:
     blind = EgoController(unsafe_distance_m=0.0, closing_distance_m=0.0)
-    scene = _with_standing_vehicle(own_network("merge"), 50.0).scene(controller=blind)
+    scene = _with_standing_vehicle(user_network("merge"), 50.0).scene(controller=blind)
     with begun(scene) as simulation:
         for _ in drive(simulation, 200):
             pass
@@ -117,8 +117,8 @@ def test_touching_a_vehicle_is_a_collision_with_its_vtype(own_network: Make) -> 
         assert 50.0 - 7.0 < egos.front_m[0] < 50.0 - 7.0 + 0.3 + 1e-6  # the van's back is at 43 m
 
 
-def test_the_safety_check_holds_the_ego_behind_a_standing_vehicle(own_network: Make) -> None:
-    scene = _with_standing_vehicle(own_network("merge"), 50.0).scene()
+def test_the_safety_check_holds_the_ego_behind_a_standing_vehicle(user_network: Make) -> None:
+    scene = _with_standing_vehicle(user_network("merge"), 50.0).scene()
     with begun(scene) as simulation:
         for _ in drive(simulation, 200):
             pass
@@ -126,7 +126,7 @@ def test_the_safety_check_holds_the_ego_behind_a_standing_vehicle(own_network: M
         assert not simulation.egos.collided[0]
 
 
-def _with_standing_vehicle(network: OwnNetwork, front_m: float) -> OwnNetwork:
+def _with_standing_vehicle(network: UserNetwork, front_m: float) -> UserNetwork:
     """The same without other traffic, and with a van on the ramp."""
     folder = network.sumocfg.parent
     (folder / "standing.rou.xml").write_text(
@@ -140,10 +140,10 @@ def _with_standing_vehicle(network: OwnNetwork, front_m: float) -> OwnNetwork:
     )
 
 
-def test_an_episode_depends_on_its_seed_alone_whatever_the_backend(own_network: Make) -> None:
-    scene = own_network("merge").scene()
+def test_an_episode_depends_on_its_seed_alone_whatever_the_backend(user_network: Make) -> None:
+    scene = user_network("merge").scene()
 
-    def lived(simulation: OwnSimulation, seed: int) -> list[bytes]:
+    def lived(simulation: SumocfgSimulation, seed: int) -> list[bytes]:
         simulation.reset(0, seed)
         slots, egos = simulation.slots, simulation.egos
         return [
@@ -151,7 +151,7 @@ def test_an_episode_depends_on_its_seed_alone_whatever_the_backend(own_network: 
             for _ in drive(simulation, 150)
         ]
 
-    first, second = OwnSimulation(scene), OwnSimulation(scene)
+    first, second = SumocfgSimulation(scene), SumocfgSimulation(scene)
     try:
         assert (first.backend, second.backend) == ("libsumo", "traci")
         once = lived(first, 1)
@@ -163,8 +163,8 @@ def test_an_episode_depends_on_its_seed_alone_whatever_the_backend(own_network: 
         second.close()
 
 
-def test_leaders_are_seen_with_gaps_from_bumper_to_bumper(own_network: Make) -> None:
-    scene = own_network("merge").scene(sight_m=100.0)
+def test_leaders_are_seen_with_gaps_from_bumper_to_bumper(user_network: Make) -> None:
+    scene = user_network("merge").scene(sight_m=100.0)
     seen = 0
     with begun(scene) as simulation:
         slots = simulation.slots
@@ -179,8 +179,8 @@ def test_leaders_are_seen_with_gaps_from_bumper_to_bumper(own_network: Make) -> 
     assert seen > 20
 
 
-def test_a_cleared_simulation_stands_still(own_network: Make) -> None:
-    with begun(own_network("merge").scene()) as simulation:
+def test_a_cleared_simulation_stands_still(user_network: Make) -> None:
+    with begun(user_network("merge").scene()) as simulation:
         simulation.clear(0)
         time_s = simulation.connection.simulation.getTime()
         simulation.step(np.array([3.0]))
@@ -188,8 +188,8 @@ def test_a_cleared_simulation_stands_still(own_network: Make) -> None:
         assert not simulation.slots.present.any()
 
 
-def test_the_end_of_the_route_is_past_the_goal(own_network: Make) -> None:
-    network = own_network("merge")
+def test_the_end_of_the_route_is_past_the_goal(user_network: Make) -> None:
+    network = user_network("merge")
     end_m = network.scene().route_edge_start_m[1] + 145.0
     scene = network.scene(start_m=end_m - 20.0, goal_m=end_m - 0.01)
     with begun(scene) as simulation:
@@ -198,45 +198,45 @@ def test_the_end_of_the_route_is_past_the_goal(own_network: Make) -> None:
         assert simulation.egos.collided[0] or simulation.egos.front_m[0] > scene.goal_m
 
 
-def test_vehicles_where_the_ego_starts_are_told(own_network: Make) -> None:
-    scene = _with_standing_vehicle(own_network("merge"), 22.0).scene()
+def test_vehicles_where_the_ego_starts_are_told(user_network: Make) -> None:
+    scene = _with_standing_vehicle(user_network("merge"), 22.0).scene()
     with pytest.raises(InputError, match=r"no room at its start \(20 m\)"), begun(scene):
         pass
 
 
-def test_demand_that_sumo_refuses_is_told_in_one_line(own_network: Make) -> None:
-    network = own_network("merge")
+def test_demand_that_sumo_refuses_is_told_in_one_line(user_network: Make) -> None:
+    network = user_network("merge")
     folder = network.sumocfg.parent
     (folder / "wrong.rou.xml").write_text(
         '<routes><vehicle id="wrong" depart="0"><route edges="nowhere"/></vehicle></routes>'
     )
     sumocfg = write_config(folder / "wrong.sumocfg", "merge.net.xml", "wrong.rou.xml")
-    scene = OwnNetwork(sumocfg, network.ego_route, 20.0, 100.0).scene()
+    scene = UserNetwork(sumocfg, network.ego_route, 20.0, 100.0).scene()
     for backend in ("libsumo", "traci"):
         with pytest.raises(InputError, match=r"SUMO does not run .*wrong\.sumocfg") as caught:
-            OwnSimulation(scene, backend)
+            SumocfgSimulation(scene, backend)
         assert "\n" not in str(caught.value)
 
 
-def test_what_the_configuration_writes_is_left_unwritten(own_network: Make) -> None:
-    network = own_network("merge")
+def test_what_the_configuration_writes_is_left_unwritten(user_network: Make) -> None:
+    network = user_network("merge")
     folder = network.sumocfg.parent
     more = '<output><tripinfo-output value="trips.xml"/><fcd-output value="fcd.xml"/></output>'
     sumocfg = write_config(folder / "writing.sumocfg", "merge.net.xml", "merge.rou.xml", more)
-    with begun(OwnNetwork(sumocfg, network.ego_route, 20.0, 100.0).scene()) as simulation:
+    with begun(UserNetwork(sumocfg, network.ego_route, 20.0, 100.0).scene()) as simulation:
         simulation.step(np.array([3.0]))
     assert not (folder / "trips.xml").exists()
     assert not (folder / "fcd.xml").exists()
 
 
-def test_there_is_one_simulation_per_process(own_network: Make) -> None:
+def test_there_is_one_simulation_per_process(user_network: Make) -> None:
     with pytest.raises(InputError, match="set workers to num_envs"):
-        make_simulation(2, own_network("merge").scene())
+        make_simulation(2, user_network("merge").scene())
 
 
 @pytest.mark.parametrize("backend", ["libsumo", "traci"])
-def test_an_ego_that_sumo_teleports_is_told(backend: Backend, own_network: Make) -> None:
-    network = _with_standing_vehicle(own_network("merge"), 90.0)
+def test_an_ego_that_sumo_teleports_is_told(backend: Backend, user_network: Make) -> None:
+    network = _with_standing_vehicle(user_network("merge"), 90.0)
     text = network.sumocfg.read_text().replace("</configuration>", '<time-to-teleport value="5"/></configuration>')
     impatient = network.sumocfg.with_name("impatient.sumocfg")
     impatient.write_text(text)

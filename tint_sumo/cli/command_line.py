@@ -219,9 +219,9 @@ class Record(SpreadCommand):
     def run(self) -> Outcome:
         from tint_sumo.dataset.recorder import record
         from tint_sumo.dataset.sumocfg_recorder import record_sumocfg
-        from tint_sumo.scenes import OwnScene
+        from tint_sumo.scenes import SumocfgScene
 
-        sumocfg = self.scene.config.file if isinstance(self.scene, OwnScene) else self.sumocfg
+        sumocfg = self.scene.config.file if isinstance(self.scene, SumocfgScene) else self.sumocfg
         if sumocfg is not None:
             self._require_nothing_but_the_configuration()
             manifest = record_sumocfg(sumocfg, self.out, self.windows, seed=self.seed, workers=self.workers)
@@ -482,13 +482,13 @@ class TrainPolicy(Command):
         from tint_sumo.jobs.status import Title
         from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.training import train_policy
-        from tint_sumo.scenes import OwnScene
+        from tint_sumo.scenes import SumocfgScene
 
         _use_one_thread()
-        is_own = isinstance(self.scene, OwnScene) and self.p_conservative == TrainPolicy.p_conservative
+        is_sumocfg = isinstance(self.scene, SumocfgScene) and self.p_conservative == TrainPolicy.p_conservative
         settings = _PPO_BUDGET.full(self.budget)
         steps = settings.total_steps if self.steps is None else self.steps
-        share = None if is_own else _share(self.p_conservative)
+        share = None if is_sumocfg else _share(self.p_conservative)
         mix = "" if share is None else share_words(share)
         with one_job(Title("train", self.method, mix, self.seed)) as report:
             policy = train_policy(

@@ -1,4 +1,4 @@
-"""Record the traffic of a SUMO configuration of one's own, in the form of every other dataset.
+"""Record the traffic of a SUMO configuration, in the form of every other dataset.
 
 An episode is a SUMO run of its own, from the configuration's begin, in steps of 0.1 s whatever its step length, because
 windows consist of such steps. The labels are the vTypes. Positions are what the odometers show, gaps those to the
@@ -34,7 +34,7 @@ _NOBODY = -1
 
 
 @dataclass(frozen=True)
-class OwnRecording:
+class SumocfgRecording:
     """What to record: at least ``windows`` windows of a configuration's traffic."""
 
     config: SumoConfig
@@ -69,7 +69,7 @@ def record_sumocfg(
     require_sizes(windows, seed)
     config = read_config(sumocfg)
     read_net(config.net_file, with_internal=False)
-    recording = OwnRecording(config, read_vtypes(config), windows, seed)
+    recording = SumocfgRecording(config, read_vtypes(config), windows, seed)
     return record_dataset(
         out,
         recording.settings(),
@@ -85,7 +85,7 @@ def record_sumocfg(
 class _Shards:
     """The shards of a recording."""
 
-    recording: OwnRecording
+    recording: SumocfgRecording
     out: Path
 
     def paths(self, number: int) -> tuple[str, ...]:
@@ -117,7 +117,7 @@ class _Row(NamedTuple):
     gap_m: float
 
 
-def _simulate_episode(recording: OwnRecording, episode: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+def _simulate_episode(recording: SumocfgRecording, episode: int) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Rows of trajectories, by vehicle and time, and of drivers."""
     config = recording.config
     with refusals(config):

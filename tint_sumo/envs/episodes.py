@@ -40,7 +40,7 @@ from tint_sumo.envs.rows import (
     observe_tracks,
     row_type,
 )
-from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene, find_scene
+from tint_sumo.scenes import T_INTERSECTION, Scene, SumocfgScene, find_scene
 from tint_sumo.scenes.geometry import Floats
 from tint_sumo.simulation.sumocfg import make_simulation
 from tint_sumo.simulation.timing import StepPart, does
@@ -57,7 +57,7 @@ class TaskSettings:
         InputError: a value makes no sense.
     """
 
-    scene: str | Scene | OwnScene = T_INTERSECTION
+    scene: str | Scene | SumocfgScene = T_INTERSECTION
     p_conservative: Share | None = None
     reward: str = "paper"
     time_limit_s: TimeS | None = None
@@ -107,11 +107,11 @@ class TaskSettings:
         return ("traits", *TRACKS) if self.tracks else ("traits",)
 
     @cached_property
-    def played(self) -> Scene | OwnScene:
+    def played(self) -> Scene | SumocfgScene:
         """The scene with these settings in place of its own."""
         scene = find_scene(self.scene)
-        if isinstance(scene, OwnScene):
-            return self._own(scene)
+        if isinstance(scene, SumocfgScene):
+            return self._sumocfg(scene)
         population, traffic = scene.population, scene.traffic
         if self.tau_s is not None:
             population = replace(population, idm=replace(population.idm, tau_s=self.tau_s))
@@ -119,12 +119,12 @@ class TaskSettings:
             traffic = replace(traffic, p_conservative=self.p_conservative)
         return replace(scene, traffic=traffic, population=population, time_limit_s=self._time_limit_s(scene))
 
-    def _own(self, scene: OwnScene) -> OwnScene:
+    def _sumocfg(self, scene: SumocfgScene) -> SumocfgScene:
         if self.p_conservative is not None or self.tau_s is not None:
             raise InputError("the demand of a .sumocfg tells who drives how; leave p_conservative and tau_s out")
         return replace(scene, time_limit_s=self._time_limit_s(scene))
 
-    def _time_limit_s(self, scene: Scene | OwnScene) -> float:
+    def _time_limit_s(self, scene: Scene | SumocfgScene) -> float:
         limit_s = scene.time_limit_s if self.time_limit_s is None else self.time_limit_s
         if self.max_episode_steps is None:
             return limit_s
@@ -142,7 +142,7 @@ def require_arguments(environment: type, task: Mapping[str, Any]) -> None:
     require_fields(task, dict.fromkeys([*named, *(field.name for field in fields(TaskSettings))]))
 
 
-def action_space(scene: Scene | OwnScene) -> spaces.Discrete:
+def action_space(scene: Scene | SumocfgScene) -> spaces.Discrete:
     return spaces.Discrete(len(scene.ego.controller.desired_speeds_mps))
 
 

@@ -15,14 +15,14 @@ from tint_sumo.scenes.geometry import SPACING_M, Floats
 from tint_sumo.scenes.layout import Layout
 from tint_sumo.scenes.sumocfg import read_net
 from tint_sumo.simulation.simulation import Simulation
-from tint_sumo.simulation.sumocfg import OwnSimulation
+from tint_sumo.simulation.sumocfg import SumocfgSimulation
 
 RENDER_FPS = 10
 _WIDTH = 736  # pixels
 _OVERSAMPLING = 3  # the image is drawn larger and scaled down, for smooth edges
 _DASH_M, _LINE_M = 1.0, 0.12
 _GRASS, _ROAD, _LINE, _EGO, _GLASS = "#e9efe3", "#8f959b", "#ffffff", (240, 180, 0), "#2b2f33"
-_AROUND_M = (30.0, 20.0)  # what is shown of a network of one's own, to each side of the ego
+_AROUND_M = (30.0, 20.0)  # what is shown of a user's network, to each side of the ego
 _SEAM_M = 0.06  # half of the line between two lanes
 # Of vTypes, by their numbers; those that follow begin again.
 _VTYPES = ((40, 90, 200), (200, 40, 40), (30, 140, 70), (130, 60, 170), (220, 110, 20), (20, 150, 170), (90, 90, 90))
@@ -38,10 +38,10 @@ def require_render_mode(render_mode: str | None, choices: Sequence[str]) -> None
         raise InputError(f"unknown render_mode {render_mode!r}; choose one of None, {', '.join(map(repr, choices))}")
 
 
-def render_scene(simulation: Simulation | OwnSimulation, replica: int) -> NDArray[np.uint8]:
+def render_scene(simulation: Simulation | SumocfgSimulation, replica: int) -> NDArray[np.uint8]:
     """Draw one replica as an (H, W, 3) image."""
-    if isinstance(simulation, OwnSimulation):
-        return _render_own(simulation)
+    if isinstance(simulation, SumocfgSimulation):
+        return _render_surroundings(simulation)
     view = simulation.scene.view
     canvas = Canvas(view, background(simulation.layout, view).copy())
     slots, shape = simulation.slots, simulation.scene.vehicle
@@ -53,8 +53,8 @@ def render_scene(simulation: Simulation | OwnSimulation, replica: int) -> NDArra
     return canvas.image()
 
 
-def _render_own(simulation: OwnSimulation) -> NDArray[np.uint8]:
-    """The surroundings of the ego in a network of one's own."""
+def _render_surroundings(simulation: SumocfgSimulation) -> NDArray[np.uint8]:
+    """The surroundings of the ego in a user's network."""
     ego, slots = simulation.egos.pose[0], simulation.slots
     x_m, y_m, across_m, up_m = float(ego["x_m"]), float(ego["y_m"]), *_AROUND_M
     view = View(x_m - across_m, y_m - up_m, x_m + across_m, y_m + up_m)

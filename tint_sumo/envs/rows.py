@@ -11,7 +11,7 @@ from tint_sumo.config import RewardPreset
 from tint_sumo.core.compiling import compiled
 from tint_sumo.scenes.geometry import Bools, Floats, Numbers, Poses
 from tint_sumo.scenes.scene import Scene
-from tint_sumo.scenes.sumocfg import OwnScene
+from tint_sumo.scenes.sumocfg import SumocfgScene
 
 Observation = dict[str, NDArray[np.float32]]
 OBSERVATION_KEYS = ("ego", "vehicles", "mask")
@@ -103,7 +103,7 @@ class TaskRules(NamedTuple):
     step: float
 
     @classmethod
-    def of(cls, scene: Scene | OwnScene, preset: RewardPreset) -> "TaskRules":
+    def of(cls, scene: Scene | SumocfgScene, preset: RewardPreset) -> "TaskRules":
         return cls(
             scene.ego.goal_m,
             round(scene.time_limit_s / scene.step_s),

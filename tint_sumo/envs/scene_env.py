@@ -16,9 +16,9 @@ from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observ
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, Observation, fields_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
-from tint_sumo.scenes import T_INTERSECTION, OwnScene, Scene
+from tint_sumo.scenes import T_INTERSECTION, Scene, SumocfgScene
 from tint_sumo.simulation.simulation import Simulation
-from tint_sumo.simulation.sumocfg import OwnSimulation
+from tint_sumo.simulation.sumocfg import SumocfgSimulation
 
 
 class SceneEnv(gymnasium.Env[Any, Any]):
@@ -125,7 +125,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012 - gymnasium's way
 
     def __init__(
-        self, scene: str | Scene | OwnScene = T_INTERSECTION, render_mode: str | None = None, **task: Any
+        self, scene: str | Scene | SumocfgScene = T_INTERSECTION, render_mode: str | None = None, **task: Any
     ) -> None:
         require_render_mode(render_mode, self.metadata["render_modes"])
         require_arguments(SceneEnv, task)
@@ -211,7 +211,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._episodes.step(actions)
 
     @property
-    def simulation(self) -> Simulation | OwnSimulation:
+    def simulation(self) -> Simulation | SumocfgSimulation:
         """What is simulated, to be looked at only; the environment is its replica 0."""
         return self._episodes.simulation
 

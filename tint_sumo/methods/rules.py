@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import POSITION_SCALE_M, SPEED_SCALE_MPS
 from tint_sumo.core.errors import InputError
-from tint_sumo.scenes import T_INTERSECTION, AnyScene, OwnScene, find_scene
+from tint_sumo.scenes import T_INTERSECTION, AnyScene, SumocfgScene, find_scene
 from tint_sumo.scenes.geometry import POSE, SPACING_M, Floats, along, as_line, place, project
 from tint_sumo.scenes.layout import Layout, layout
 
@@ -59,7 +59,7 @@ class TimeToCollision:
     @cached_property
     def _world(self) -> "_World":
         scene = find_scene(self.scene)
-        if isinstance(scene, OwnScene):
+        if isinstance(scene, SumocfgScene):
             raise InputError("ttc needs the conflict zones of a built-in scene; take another policy")
         return _World(layout(scene))
 

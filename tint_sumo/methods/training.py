@@ -33,7 +33,7 @@ from tint_sumo.methods.registry import Learned, find_learned
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
 from tint_sumo.policy.venv import policy_venv
-from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, OwnScene, described, find_scene
+from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, SumocfgScene, described, find_scene
 from tint_sumo.traits import TraitModel
 from tint_sumo.traits.storage import read_card, require_scene, save
 
@@ -172,7 +172,7 @@ def _require_drivers(learned: Learned, p_conservative: Share | None, scene: AnyS
     """Raise InputError unless a method can be trained among a scene's drivers, in such a mix."""
     played = T_INTERSECTION if scene == ALL_SCENES else scene
     found = find_scene(played)
-    if isinstance(found, OwnScene):
+    if isinstance(found, SumocfgScene):
         kinds = len(found.vtypes)
         if p_conservative is not None:
             raise InputError("the demand of a .sumocfg tells who drives how; leave p_conservative out")

@@ -12,7 +12,7 @@ from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy.action_repeat import ActionRepeat
 from tint_sumo.policy.trait_observation import TRUE_TRAITS, TraitObservation
 from tint_sumo.policy.trait_sources import OracleTraits, TraitSource
-from tint_sumo.scenes import OwnScene
+from tint_sumo.scenes import SumocfgScene
 
 
 def policy_venv(
@@ -34,7 +34,7 @@ def policy_venv(
         monitored: count steps and rewards of each episode for Stable-Baselines3's logger.
         task: as in ``tint_sumo.envs.scene_env.SceneEnv``.
     """
-    if isinstance(task.get("scene"), OwnScene):  # one simulation per process
+    if isinstance(task.get("scene"), SumocfgScene):  # one simulation per process
         task["scene"] = [task["scene"]] * num_envs
     venv: VecEnv = SceneVecEnv(num_envs, tracks=source is not None and source.needs_tracks, **task)
     if source is not None:

@@ -16,7 +16,7 @@ from tint_sumo.scenes.scene import (
     find_scene,
 )
 from tint_sumo.scenes.settings import AnyScene, described, read_described, read_scene, scene_settings
-from tint_sumo.scenes.sumocfg import OwnScene, from_sumocfg
+from tint_sumo.scenes.sumocfg import SumocfgScene, from_sumocfg
 
 __all__ = [
     "ALL_SCENES",
@@ -24,9 +24,9 @@ __all__ = [
     "T_INTERSECTION",
     "AnyScene",
     "EgoTask",
-    "OwnScene",
     "Route",
     "Scene",
+    "SumocfgScene",
     "View",
     "described",
     "digest_of",

@@ -27,7 +27,7 @@ from tint_sumo.scenes.digest import scene_digest
 from tint_sumo.scenes.network import Network, Point
 
 if TYPE_CHECKING:
-    from tint_sumo.scenes.sumocfg import OwnScene
+    from tint_sumo.scenes.sumocfg import SumocfgScene
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def register(make: Callable[[], Scene]) -> Callable[[], Scene]:
 @overload
 def find_scene(scene: str | Scene) -> Scene: ...
 @overload
-def find_scene(scene: "str | Scene | OwnScene") -> "Scene | OwnScene": ...
+def find_scene(scene: "str | Scene | SumocfgScene") -> "Scene | SumocfgScene": ...
 def find_scene(scene: Any) -> Any:
     """The scene of a name; a scene itself is given back.
 

@@ -33,10 +33,10 @@ from tint_sumo.core.structures import (
     require_known,
 )
 from tint_sumo.scenes.scene import ALL_SCENES, SCENES, T_INTERSECTION, Scene, digest_of, find_scene, require_scene_name
-from tint_sumo.scenes.sumocfg import OwnScene, from_sumocfg
+from tint_sumo.scenes.sumocfg import SumocfgScene, from_sumocfg
 
 RouteM = Annotated[float, Range(0.0, 1e6)]
-AnyScene = str | Scene | OwnScene
+AnyScene = str | Scene | SumocfgScene
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class SceneSettings:
 
 
 @dataclass(frozen=True)
-class OwnSceneSettings:
+class SumocfgSettings:
     """The arguments of ``tint_sumo.scenes.from_sumocfg``."""
 
     sumocfg: Path
@@ -122,13 +122,13 @@ class OwnSceneSettings:
     """Where on its route the ego's front is at the beginning; not on a junction."""
     goal_m: RouteM
     """The ego's front past it is a success."""
-    max_vehicles: Slots = OwnScene.max_vehicles
+    max_vehicles: Slots = SumocfgScene.max_vehicles
     """Most vehicles in an observation, the nearest ones."""
-    sight_m: DistanceM = OwnScene.sight_m
+    sight_m: DistanceM = SumocfgScene.sight_m
     """How far away they may be."""
-    warm_up_s: WarmUpS = OwnScene.warm_up_s
+    warm_up_s: WarmUpS = SumocfgScene.warm_up_s
     """For how long the traffic runs before the ego appears."""
-    time_limit_s: TimeS = OwnScene.time_limit_s
+    time_limit_s: TimeS = SumocfgScene.time_limit_s
     """Longest time of an episode."""
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     """The ego's shape."""
@@ -136,11 +136,11 @@ class OwnSceneSettings:
     """How the ego drives; its desired speeds are the actions."""
 
     @classmethod
-    def of(cls, scene: OwnScene) -> Self:
+    def of(cls, scene: SumocfgScene) -> Self:
         found = {one.name: getattr(scene, one.name) for one in fields(cls) if one.name != "sumocfg"}
         return cls(sumocfg=scene.config.file, **found)
 
-    def scene(self) -> OwnScene:
+    def scene(self) -> SumocfgScene:
         return from_sumocfg(**{one.name: getattr(self, one.name) for one in fields(self)})
 
 
@@ -160,7 +160,7 @@ def read_scene(value: Any, where: Where = ()) -> AnyScene:
     if not is_mapping(value, SCENES, where):
         return require_known(value, SCENES, where)
     if "sumocfg" in value:
-        settings: Any = build(OwnSceneSettings, value, where)
+        settings: Any = build(SumocfgSettings, value, where)
     else:
         base = require_base(value, SCENES, T_INTERSECTION, where)
         settings = overlay(SceneSettings.of(find_scene(base)), value, where)
@@ -171,15 +171,15 @@ def read_scene(value: Any, where: Where = ()) -> AnyScene:
     return made
 
 
-def scene_settings(scene: AnyScene) -> SceneSettings | OwnSceneSettings:
+def scene_settings(scene: AnyScene) -> SceneSettings | SumocfgSettings:
     """What a file says of a scene, in full.
 
     Raises:
         InputError: there is no such scene, or its roads are those of no built-in one.
     """
     found = find_scene(scene)
-    if isinstance(found, OwnScene):
-        return OwnSceneSettings.of(found)
+    if isinstance(found, SumocfgScene):
+        return SumocfgSettings.of(found)
     if (found.base or found.name) not in SCENES:
         raise InputError(f"the roads of scene {found.name} are of no built-in scene; register it in SCENES")
     return SceneSettings.of(found)
@@ -189,7 +189,7 @@ def described(scene: AnyScene) -> dict[str, Any]:
     """What the settings and the card of a run say of its scene, or of all; ``read_described`` finds it again."""
     if isinstance(scene, str):
         return {"scene": scene, "scene_digest": digest_of(scene)}
-    changed = isinstance(scene, OwnScene) or scene.base
+    changed = isinstance(scene, SumocfgScene) or scene.base
     settings = {"scene_settings": plain(scene_settings(scene))} if changed else {}
     return {"scene": scene.name, "scene_digest": scene.digest, **settings}
 

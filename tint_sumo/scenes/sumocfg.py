@@ -1,4 +1,4 @@
-"""Scenes of one's own: any SUMO configuration, with its own network and demand, through which the ego is driven.
+"""Scenes made from any SUMO configuration, with its network and demand, through which the ego is driven.
 
 The drivers are those of the configuration, and so are the rules by which they meet the ego: SUMO's. Whoever wants to
 learn their traits takes their vTypes for labels.
@@ -64,7 +64,7 @@ class SumoConfig:
 
 
 @dataclass(frozen=True)
-class OwnScene:
+class SumocfgScene:
     """A SUMO configuration and the ego's task in it; ``from_sumocfg`` makes one.
 
     Lengths along the ego's route are those that SUMO's odometer shows, lanes on junctions included. Vehicles are seen
@@ -117,13 +117,13 @@ def from_sumocfg(
     start_m: float,
     goal_m: float,
     *,
-    max_vehicles: int = OwnScene.max_vehicles,
-    sight_m: float = OwnScene.sight_m,
-    warm_up_s: float = OwnScene.warm_up_s,
-    time_limit_s: float = OwnScene.time_limit_s,
+    max_vehicles: int = SumocfgScene.max_vehicles,
+    sight_m: float = SumocfgScene.sight_m,
+    warm_up_s: float = SumocfgScene.warm_up_s,
+    time_limit_s: float = SumocfgScene.time_limit_s,
     vehicle: VehicleShape | None = None,
     controller: EgoController | None = None,
-) -> OwnScene:
+) -> SumocfgScene:
     """A scene of the configuration's network and demand.
 
     Args:
@@ -153,7 +153,7 @@ def from_sumocfg(
     if not any(first_m <= start_m <= last_m for first_m, last_m in spans_m):
         ends = ", ".join(f"{first_m:.1f} to {last_m:.1f}" for first_m, last_m in spans_m)
         raise InputError(f"the ego's start ({start_m:g} m) is on a junction; its route's edges are at {ends} m")
-    return OwnScene(
+    return SumocfgScene(
         name=config.name,
         config=config,
         vtypes=read_vtypes(config),

@@ -10,7 +10,7 @@ from tint_sumo.core.compiling import compiled
 from tint_sumo.scenes.geometry import POSE, SPACING_M, Bools, Floats, Numbers, Poses, measure_distances_m, place
 from tint_sumo.scenes.layout import Layout
 from tint_sumo.scenes.scene import Scene
-from tint_sumo.scenes.sumocfg import OwnScene
+from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation.slots import EMPTY, Slots
 from tint_sumo.simulation.timing import StepPart, does
 
@@ -45,7 +45,7 @@ class EgoRules(NamedTuple):
     way_spacing_m: float
 
     @classmethod
-    def of(cls, scene: Scene | OwnScene) -> "EgoRules":
+    def of(cls, scene: Scene | SumocfgScene) -> "EgoRules":
         controller = scene.ego.controller
         return cls(
             controller.gain_per_s,

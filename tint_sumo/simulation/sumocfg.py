@@ -1,4 +1,4 @@
-"""The simulation of a scene of one's own: one episode at a time, with the traffic that the user's configuration makes.
+"""The simulation of a SUMO configuration: one episode at a time, with the traffic that the configuration makes.
 
 Each episode loads the configuration anew with a seed of its own, so that it depends on that seed alone. The vehicles
 around the ego are asked for with a context subscription, at the same cost however large the network is.
@@ -19,7 +19,7 @@ from tint_sumo.config import NO_LEADER_GAP_M, Backend
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.geometry import POSE, Bools, Floats, Numbers, Poses, measure_unlike_distances_m
 from tint_sumo.scenes.scene import Scene
-from tint_sumo.scenes.sumocfg import DEFAULT_VTYPE, OwnScene, SumoConfig
+from tint_sumo.scenes.sumocfg import DEFAULT_VTYPE, SumocfgScene, SumoConfig
 from tint_sumo.simulation.connection import Connection, connect
 from tint_sumo.simulation.ego import Collision, EgoRules, check_safety, drive
 from tint_sumo.simulation.simulation import Simulation
@@ -105,7 +105,7 @@ def refusals(config: SumoConfig) -> Iterator[None]:
         raise InputError(f"SUMO does not run {config.file} ({reason}); try it with: sumo -c {config.file}") from None
 
 
-class OwnSlots:
+class SumocfgSlots:
     """The vehicles around the ego in V slots; arrays are (1, V), as in ``tint_sumo.simulation.slots.Slots``.
 
     ``member`` is the number of a vehicle's vType, ``front_m`` what its odometer shows, and ``length_m`` and ``width_m``
@@ -170,10 +170,10 @@ def pose_of(sight: Sight, length_m: float, origin_m: tuple[float, float]) -> tup
     return x_m - half_m * heading_x - origin_m[0], y_m - half_m * heading_y - origin_m[1], heading_x, heading_y
 
 
-class OwnEgos:
+class SumocfgEgos:
     """The one ego; arrays are (1,), as in ``tint_sumo.simulation.ego.Egos``."""
 
-    def __init__(self, scene: OwnScene) -> None:
+    def __init__(self, scene: SumocfgScene) -> None:
         self._scene = scene
         self._rules = EgoRules.of(scene)
         self.front_m: Floats = np.zeros(1)
@@ -215,7 +215,7 @@ class OwnEgos:
         """It has come to its route's end, past any goal."""
         self.front_m[0] = np.inf
 
-    def look_around(self, slots: OwnSlots) -> int:
+    def look_around(self, slots: SumocfgSlots) -> int:
         """Run the safety check for the next step; the slot of a vehicle that it has newly touched, else -1."""
         shape = self._scene.vehicle
         self.distance_m, self._was_distance_m = self._was_distance_m, self.distance_m
@@ -235,17 +235,17 @@ class OwnEgos:
         return int(self._hit_slot[0]) if touched else EMPTY
 
 
-class OwnSimulation:
-    """One replica of a scene of one's own; empty until its first ``reset``.
+class SumocfgSimulation:
+    """One replica of a scene from a SUMO configuration; empty until its first ``reset``.
 
-    Read-only state: the vehicles in ``slots`` (``OwnSlots``) and the ego in ``egos`` (``OwnEgos``), both in a
+    Read-only state: the vehicles in ``slots`` (``SumocfgSlots``) and the ego in ``egos`` (``SumocfgEgos``), both in a
     frame with the network's axes, whose origin is where the ego's centre is at the episode's start.
     """
 
     replicas = 1
     passed_m: Floats = np.array([np.inf])  # no vehicle's way is ever left behind
 
-    def __init__(self, scene: OwnScene, backend: Backend = "auto") -> None:
+    def __init__(self, scene: SumocfgScene, backend: Backend = "auto") -> None:
         self.scene = scene
         self.traits = scene.vtypes
         self.trait_of_member: Numbers = np.arange(len(scene.vtypes))
@@ -253,8 +253,8 @@ class OwnSimulation:
             self.connection = connect(sumo_options(scene.config, seed=0), backend)
         self._kinds = Kinds(scene.config, scene.vtypes, self.connection)
         self._drives = False
-        self.slots = OwnSlots(scene.max_vehicles)
-        self.egos = OwnEgos(scene)
+        self.slots = SumocfgSlots(scene.max_vehicles)
+        self.egos = SumocfgEgos(scene)
         self.origin_m = (0.0, 0.0)  # position of the scene's origin in the network
 
     @property
@@ -380,11 +380,13 @@ def leader_of(connection: Connection, vehicle_id: str, kind: VehicleKind) -> tup
     return (found[0], found[1] + kind.min_gap_m) if found else ("", math.nan)
 
 
-def make_simulation(replicas: int, scene: Scene | OwnScene, backend: Backend = "auto") -> Simulation | OwnSimulation:
+def make_simulation(
+    replicas: int, scene: Scene | SumocfgScene, backend: Backend = "auto"
+) -> Simulation | SumocfgSimulation:
     """The simulation that plays a scene.
 
     Raises:
-        InputError: more than one replica of a scene of one's own.
+        InputError: more than one replica of a SUMO configuration.
     """
     if isinstance(scene, Scene):
         return Simulation(replicas, scene, backend=backend)
@@ -392,4 +394,4 @@ def make_simulation(replicas: int, scene: Scene | OwnScene, backend: Backend = "
         raise InputError(
             f"a scene from a .sumocfg is one simulation per process, not {replicas}; set workers to num_envs"
         )
-    return OwnSimulation(scene, backend)
+    return SumocfgSimulation(scene, backend)

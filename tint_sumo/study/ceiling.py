@@ -23,7 +23,7 @@ def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str | Sc
 
     Args:
         p_conservative, episodes, seed: of the cases, see ``tint_sumo.methods.evaluation.evaluate``.
-        scene: name of the scene, or a scene of one's own.
+        scene: name of the scene, or a scene.
     """
     played = find_scene(scene)
     played = replace(played, traffic=replace(played.traffic, p_conservative=p_conservative))

@@ -18,7 +18,7 @@ from tint_sumo.core.files import RUN_FILE, damaged, read_json, write_text
 from tint_sumo.jobs import Workers
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import read_versions
-from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION, OwnScene, Scene, read_described
+from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION, Scene, SumocfgScene, read_described
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.page.charts import Chart, curve_chart, outcome_chart, world_charts
 from tint_sumo.study.page.choosing import choose
@@ -92,7 +92,7 @@ def read_scene_of(out: Path) -> str | Scene:
         scene = read_described(settings)
     except InputError as error:
         raise damaged(out / RUN_FILE, "run settings", error) from None
-    if isinstance(scene, OwnScene) or scene == ALL_SCENES:
+    if isinstance(scene, SumocfgScene) or scene == ALL_SCENES:
         raise damaged(out / RUN_FILE, "run settings", "scene: no study is of such scenes")
     return scene
 

@@ -17,7 +17,8 @@ from typing import Any
 import pytest
 import yaml
 
-from tint_sumo.cli.command_line import SpreadCommand, parse
+from tint_sumo.cli.command import SpreadCommand
+from tint_sumo.cli.command_line import parse
 
 ROOT = Path(__file__).parents[1]
 CLUSTER = ROOT / "examples" / "cluster"

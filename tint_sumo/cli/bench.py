@@ -1,0 +1,19 @@
+"""``tint-sumo bench``."""
+
+from dataclasses import dataclass
+
+from tint_sumo.cli.command import Command, Outcome
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench(Command):
+    """Measure how fast the environments and the recorder are on this machine, against SUMO's own speed."""
+
+    quick: bool = False
+    """Measure less, for a first look; 2 to 4 minutes on a free machine otherwise."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.bench import QUICK, Sizes, run_benchmark
+
+        found = run_benchmark(QUICK if self.quick else Sizes())
+        return Outcome(found.table(), found.to_json())

@@ -1,0 +1,91 @@
+"""Base classes of commands. A command is a dataclass whose fields are its flags."""
+
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.stores import name_in
+
+if TYPE_CHECKING:
+    from tint_sumo.jobs import Workers
+
+
+RESUMES = ", the same command goes on from here"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command prints: lines for people and, with --json, one object."""
+
+    text: str
+    content: dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    after_interrupt: ClassVar[str] = ", nothing was kept"
+
+    json: bool = False
+    """Print one JSON object as the last line of stdout."""
+    config: Path | None = None
+    """YAML file with values of these flags, named as here but with underscores; flags that are given here win. A scene,
+    a budget or a population can be a mapping there: of its base, and the numbers that differ."""
+    print_config: bool = False
+    """Print all values as such a file, and do nothing else."""
+
+    def run(self) -> Outcome:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpreadCommand(Command):
+    """A command whose work many machines can share."""
+
+    executor: Literal["local", "ray"] = "local"
+    """local: this machine; ray: a Ray cluster, with the same results (needs tint_sumo[ray])."""
+    address: str = "auto"
+    """Address of the Ray cluster, ray://HOST:10001; local: Ray on this machine alone; auto: the cluster that
+    RAY_ADDRESS names or that runs on this machine or, if there is none, local."""
+
+    @contextmanager
+    def workers_of(self, workers: int, gpus_per_job: float = 0.0) -> "Iterator[Workers]":
+        """In the block, what does the work: so many processes, or the cluster."""
+        if self.executor == "local":
+            for flag, value, default in (("address", self.address, "auto"), ("gpus-per-job", gpus_per_job, 0.0)):
+                if value != default:
+                    raise InputError(f"--{flag} goes with --executor ray; add that, or leave it out")
+            yield workers
+            return
+        if workers != getattr(type(self), "workers", workers):  # a command without that flag uses no processes
+            raise InputError("--workers goes with --executor local; a cluster does as many jobs as it has room for")
+        try:
+            from tint_sumo.jobs.cluster import ray_cluster
+        except ModuleNotFoundError as error:
+            if error.name != "ray":
+                raise
+            raise InputError('--executor ray needs Ray; install it: pip install "tint_sumo[ray]"') from None
+        with ray_cluster(self.address, gpus_per_job) as found:
+            if found.dashboard_url:
+                print(f"Ray's dashboard: http://{found.dashboard_url}", file=sys.stderr)
+            yield found
+
+
+def names_in(out: str, folder: Path, files: Iterable[Path | None]) -> list[str]:
+    """What the user calls files of a folder that stands for the output folder ``out``."""
+    return [name_in(out, file.relative_to(folder)) for file in files if file is not None]
+
+
+def wrote(files: Iterable[str]) -> Iterator[str]:
+    """Lines that tell of the files that were written."""
+    return (f"wrote {file}" for file in files)
+
+
+def use_one_thread() -> None:
+    """The networks are small: more threads gain little, and cost a multiple as soon as other work needs the cores."""
+    import torch
+
+    torch.set_num_threads(1)

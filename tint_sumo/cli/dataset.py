@@ -1,0 +1,113 @@
+"""``tint-sumo record`` and ``tint-sumo dataset``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+from tyro.conf import Positional, Suppress, arg, subcommand
+
+from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, wrote
+from tint_sumo.cli.values import SCENES, FolderOrUrl, PopulationValue, SceneValue, ShareFlag, share_of
+from tint_sumo.config import TrafficSeed, WindowCount
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import PICTURE_SUFFIXES, require_output_file
+from tint_sumo.core.ranges import Processes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record(SpreadCommand):
+    """Record a dataset of traffic without the ego vehicle; the same command resumes an interrupted recording."""
+
+    after_interrupt: ClassVar[str] = RESUMES
+
+    out: FolderOrUrl
+    """Folder for the dataset, or a URL such as s3://bucket/folder."""
+    windows: WindowCount = 30_000
+    """At least so many windows of up to 20 steps of 0.1 s."""
+    p_conservative: ShareFlag = (0.5,)
+    """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
+    population: PopulationValue = None
+    """traits: conservative and aggressive drivers; continuous: desired speeds and gaps without classes; the scene's
+    drivers, traits in all that are built in, if not given."""
+    seed: TrafficSeed = 0
+    """Seed of the traffic."""
+    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}.")] = "t_intersection"
+    workers: Processes = 1
+    """Processes of this machine that simulate; the dataset does not depend on their number."""
+    format: Literal["parquet", "fcd"] = "parquet"
+    """Parquet is always written; fcd: SUMO's floating-car data, too, also for a dataset that is there already."""
+    sumocfg: Path | None = None
+    """A SUMO configuration of your own in place of a scene: its network and demand, its vTypes as labels."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.dataset.recorder import record
+        from tint_sumo.dataset.sumocfg_recorder import record_sumocfg
+        from tint_sumo.scenes import SumocfgScene
+
+        sumocfg = self.scene.config.file if isinstance(self.scene, SumocfgScene) else self.sumocfg
+        if sumocfg is not None:
+            self._require_nothing_but_the_configuration()
+            manifest = record_sumocfg(sumocfg, self.out, self.windows, seed=self.seed, workers=self.workers)
+            return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
+        with self.workers_of(self.workers) as workers:
+            manifest = record(
+                self.out,
+                self.windows,
+                p_conservative=share_of(self.p_conservative),
+                population=self.population,
+                seed=self.seed,
+                scene=self.scene,
+                workers=workers,
+                fcd=self.format == "fcd",
+            )
+        return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
+
+    def _require_nothing_but_the_configuration(self) -> None:
+        flags = ["p_conservative", "population", "format"]
+        other = "the sumocfg of a scene"
+        if self.executor != "local":
+            raise InputError("a .sumocfg is on this machine alone; use --executor local")
+        if self.sumocfg is not None:
+            flags.append("scene")
+            other = "--sumocfg"
+        for flag in flags:
+            if getattr(self, flag) != getattr(Record, flag):
+                name = flag.replace("_", "-")
+                raise InputError(f"--{name} does not go with {other}, which tells all of the traffic; leave it out")
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectDataset(Command):
+    """Tell what is in a dataset: counts, settings, and distributions of speed and gap per driver trait."""
+
+    data: Positional[Path]
+    """Folder of a dataset."""
+    figure: Path | None = None
+    """Where a picture of the distributions goes: .png, .jpg, .webp, .svg or .pdf."""
+    verify: bool = False
+    """Compare all files with the checksums of the manifest first."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.dataset.inspection import inspect, plot, report
+        from tint_sumo.dataset.schema import verify
+        from tint_sumo.dataset.windows import read_manifest
+
+        if self.figure is not None:
+            require_output_file(self.figure, PICTURE_SUFFIXES, "--figure")
+        verified = verify(self.data, read_manifest(self.data)) if self.verify else None
+        found = inspect(self.data)
+        text = report(found)
+        if verified is not None:
+            text += f"\nall {verified} files are as they were recorded"
+        if self.figure is not None:
+            plot(found, self.figure)
+            text = "\n".join([text, *wrote([str(self.figure)])])
+        return Outcome(text, {"data": str(self.data), "verified_files": verified, **found.summary()})
+
+
+# tyro makes subcommands of unions only, hence the None.
+@dataclass(frozen=True)
+class Dataset:
+    """Recorded datasets."""
+
+    command: Annotated[InspectDataset, subcommand("inspect")] | Suppress[None]

@@ -1,0 +1,34 @@
+"""``tint-sumo net``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import arg
+
+from tint_sumo.cli.command import Command, Outcome
+from tint_sumo.cli.values import SCENES, SceneValue
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.ranges import Range
+
+
+@dataclass(frozen=True, kw_only=True)
+class Net(Command):
+    """Build a scene's road network, the drivers and plain SUMO's configuration with netconvert."""
+
+    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}.")] = "t_intersection"
+    replicas: Annotated[int, Range(1, 10_000)] = 1
+    """Number of intersections in the network."""
+    out: Path = Path("sumo_net")
+    """Folder for the files; files of the same names are replaced if this command wrote them."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.scenes import Scene, find_scene
+        from tint_sumo.scenes.build import CONFIG_FILE, write_scene
+
+        scene = find_scene(self.scene)
+        if not isinstance(scene, Scene):
+            raise InputError(f"scene {scene.name} has SUMO's files already")
+        files = write_scene(self.out, scene, self.replicas)
+        text = f"wrote {len(files)} files to {self.out}; run them with: sumo -c {self.out / CONFIG_FILE}"
+        return Outcome(text, {"replicas": self.replicas, "files": [str(file) for file in files]})

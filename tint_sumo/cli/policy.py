@@ -1,0 +1,207 @@
+"""``tint-sumo policy``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from tyro.conf import arg, subcommand
+
+from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, use_one_thread, wrote
+from tint_sumo.cli.values import PPO_BUDGET, SCENES, Cases, FolderOrUrl, PpoBudgetValue, SceneValue, ShareFlag, share_of
+from tint_sumo.config import Decisions, NoiseM, Seed, TauS
+from tint_sumo.core.percentages import percent
+from tint_sumo.core.ranges import Processes, Range
+from tint_sumo.core.stores import name_in, working_folder
+from tint_sumo.core.structures import Many
+
+if TYPE_CHECKING:
+    from tint_sumo.methods.loading import Contender
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainPolicy(Command):
+    """Train a navigation policy with PPO; the same command resumes an interrupted training."""
+
+    after_interrupt: ClassVar[str] = RESUMES
+
+    method: str
+    """Learned method: no_labels, morton, vae, no_attention, cross_window, streaming, streaming_critic, ma or oracle."""
+    out: Path
+    """Folder for the policy, its card, the training's curve and the TensorBoard log."""
+    p_conservative: ShareFlag = (0.1, 0.9)
+    """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
+    steps: Decisions | None = None
+    """Decisions of the policy; those of the budget if not given."""
+    seed: Seed = 0
+    """Seed of the training, 0 to 1000."""
+    budget: PpoBudgetValue = "full"
+    """Sizes of the network, settings of PPO and number of decisions. full takes 5 to 8 minutes on a free core."""
+    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}, or all of them at once: all.")] = "t_intersection"
+    traits: str | None = None
+    """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file; the
+    shipped one of the method if not given."""
+    other_scene: bool = False
+    """Take a trait model that was trained in another scene, too."""
+    zip: bool = False
+    """Write the policy as Stable-Baselines3's policy.zip, too. That is a pickle: others must trust you to read it."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.config import share_words
+        from tint_sumo.films.training_films import film_policy
+        from tint_sumo.jobs.status import Title
+        from tint_sumo.jobs.table import one_job
+        from tint_sumo.methods.training import train_policy
+        from tint_sumo.scenes import SumocfgScene
+
+        use_one_thread()
+        is_sumocfg = isinstance(self.scene, SumocfgScene) and self.p_conservative == TrainPolicy.p_conservative
+        settings = PPO_BUDGET.full(self.budget)
+        steps = settings.total_steps if self.steps is None else self.steps
+        share = None if is_sumocfg else share_of(self.p_conservative)
+        mix = "" if share is None else share_words(share)
+        with one_job(Title("train", self.method, mix, self.seed)) as report:
+            policy = train_policy(
+                self.method,
+                share,
+                steps,
+                self.seed,
+                self.out,
+                settings=settings,
+                scene=self.scene,
+                traits=self.traits,
+                other_scene=self.other_scene,
+                with_zip=self.zip,
+                film=film_policy,
+                report=report,
+            )
+        content = {"model": str(policy), "method": self.method, "p_conservative": self.p_conservative}
+        return Outcome(f"trained {self.method}: {policy}", {**content, "steps": steps, "seed": self.seed})
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluatePolicy(SpreadCommand):
+    """Evaluate a policy on unseen cases, which are the same for every policy; rates are fractions of episodes."""
+
+    model: str
+    """A shipped policy by its method's name (streaming, oracle, ...), always_go, ttc, the folder of a training run, a
+    .safetensors file, or with --allow-pickle a .zip file."""
+    p_conservative: ShareFlag | None = None
+    """Probability that a driver is conservative, 0 to 1, or two numbers between which each case draws its own; those
+    of the policy's training if not given."""
+    scene: SceneValue = None
+    """Scene; the one the policy was trained in if not given, for always_go and ttc t_intersection."""
+    noise: NoiseM = 0.0
+    """Standard deviation of the noise on the others' positions, m."""
+    tau: TauS | None = None
+    """Time headway of the other drivers, s; the scene's if not given, 1 s in all that are built in."""
+    episodes: Cases = 500
+    """Number of cases."""
+    seed: Seed = 0
+    """Which set of cases, 0 to 1000."""
+    allow_pickle: bool = False
+    """Read .zip files, which can run any code: only for files you trust."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.core.progress import progress_bar
+        from tint_sumo.envs.rows import OUTCOMES
+        from tint_sumo.methods.evaluation import evaluate
+        from tint_sumo.methods.evaluation_jobs import evaluate_on
+        from tint_sumo.methods.loading import load_policy
+
+        use_one_thread()
+        given = {"scene": self.scene, "allow_pickle": self.allow_pickle}
+        contender = load_policy(self.model, **given)
+        world = world_of(contender, self.p_conservative, self.noise, self.tau)
+        with self.workers_of(1) as workers:
+            if isinstance(workers, int):
+                with progress_bar(self.model) as report:
+                    evaluation = evaluate(
+                        contender.policy,
+                        lambda num_envs: contender.make_venv(num_envs, **world),
+                        self.episodes,
+                        self.seed,
+                        report=report,
+                    )
+            else:
+                evaluation = evaluate_on(workers, self.model, contender, world, self.episodes, self.seed, **given)
+        rates = {outcome: evaluation.rate(outcome) for outcome in OUTCOMES}
+        lines = [
+            f"{outcome:9} {percent(rate.value):>5}%  (95 % interval {low}% to {high}%)"
+            for outcome, rate in rates.items()
+            for low, high in (map(percent, rate.interval),)
+        ]
+        time_s = evaluation.navigation_time_s
+        lines.append("no success" if time_s is None else f"navigation time {time_s:.1f} s")
+        place = {"model": self.model, "scene": contender.scene_name, **world}
+        return Outcome("\n".join(lines), {**place, "seed": self.seed, **evaluation.summary()})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepPolicy(SpreadCommand):
+    """Train and test methods with other settings of PPO, all combinations; the same command resumes it. Tests are on
+    cases that are reported nowhere (set 1000), so that settings can be chosen by them."""
+
+    after_interrupt: ClassVar[str] = RESUMES
+
+    set: Annotated[Many[str], arg(metavar="NAME=VALUE,VALUE [NAME=VALUE,VALUE ...]")]
+    """Values of PPO's settings, all behind one --set, such as learning_rate=0.001,0.003 n_epochs=2,4; names of the
+    network's settings begin with policy, such as policy.hidden_size=32,64."""
+    out: FolderOrUrl
+    """Folder of the sweep, or a URL such as s3://bucket/folder."""
+    methods: Many[str] = ("oracle",)
+    """Learned methods: no_labels, morton, vae, no_attention, cross_window, streaming, streaming_critic, ma, oracle."""
+    seeds: Many[Seed] = (0,)
+    """Seeds of the trainings, 0 to 1000."""
+    p_conservative: ShareFlag = (0.1, 0.9)
+    """Probability in training that a driver is conservative, 0 to 1; two numbers: each episode draws its own between
+    them. Tests are at those of 0.25, 0.4 and 0.6 that this includes."""
+    budget: PpoBudgetValue = "full"
+    """Sizes of the network, settings of PPO and number of decisions, where --set does not say others."""
+    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}.")] = "t_intersection"
+    episodes: Cases = 500
+    """Number of cases of each test."""
+    workers: Processes = 2
+    """Processes of this machine at a time."""
+    gpus_per_job: Annotated[float, Range(0.0, 64.0)] = 0.0
+    """Share of a GPU for each training, with --executor ray and where the cluster has GPUs."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.comparisons.sweep import Sweep, read_varied, report_markdown, run_sweep
+
+        sweep = Sweep(
+            PPO_BUDGET.full(self.budget),
+            read_varied(self.set),
+            methods=self.methods,
+            seeds=self.seeds,
+            p_conservative=share_of(self.p_conservative),
+            scene=self.scene,
+            episodes=self.episodes,
+        )
+        with working_folder(self.out) as out, self.workers_of(self.workers, self.gpus_per_job) as workers:
+            table = run_sweep(sweep, out, workers=workers)
+        files = [name_in(self.out, name) for name in ("sweep.csv", "sweep.md")]
+        text = "\n".join([report_markdown(table, self.episodes), *wrote(files)])
+        rows = table.astype(object).where(table.notna(), None).to_dict("records")
+        return Outcome(text, {"results": rows, "files": files})
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Navigation policies."""
+
+    command: (
+        Annotated[TrainPolicy, subcommand("train")]
+        | Annotated[EvaluatePolicy, subcommand("evaluate")]
+        | Annotated[SweepPolicy, subcommand("sweep")]
+    )
+
+
+def world_of(
+    contender: "Contender", p_conservative: ShareFlag | None, noise_m: float, tau_s: float | None
+) -> dict[str, Any]:
+    """Where a policy is evaluated: what is not given is that of its training."""
+    return {
+        "p_conservative": contender.p_conservative if p_conservative is None else share_of(p_conservative),
+        "position_noise_m": noise_m,
+        "tau_s": contender.tau_s if tau_s is None else tau_s,
+    }

@@ -1,0 +1,196 @@
+"""``tint-sumo traits``."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from tyro.conf import subcommand
+
+from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, names_in, use_one_thread, wrote
+from tint_sumo.cli.values import TRAIT_BUDGET, TRAIT_STUDY, FolderOrUrl, TraitBudgetValue, TraitStudyValue
+from tint_sumo.config import NoiseM, Seed
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import require_output_file, require_output_folder
+from tint_sumo.core.percentages import percent
+from tint_sumo.core.ranges import Processes, Range
+from tint_sumo.core.stores import working_folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainTraits(Command):
+    """Train a trait model on a dataset; the same command resumes an interrupted training."""
+
+    after_interrupt: ClassVar[str] = RESUMES
+
+    data: Path
+    """Folder of a dataset."""
+    out: Path
+    """Folder for the model."""
+    method: str = "vae"
+    """vae (the paper's), cross_window and morton learn without labels, classifier with them."""
+    budget: TraitBudgetValue = "quick"
+    """quick: for about 30,000 windows; full: for some 700,000; paper: the paper's network and 1000 epochs."""
+    noise: NoiseM | None = None
+    """Standard deviation of the noise on every position in training, m; that of the budget, 0 in all that have names,
+    if not given."""
+    seed: Seed = 0
+    """Seed of the training, and of the split into training and test episodes."""
+    streaming: bool = False
+    """Keep the windows in a file beside the model instead of in memory, for large datasets; the model is the same."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.jobs.status import Title
+        from tint_sumo.jobs.table import one_job
+        from tint_sumo.traits.datasets import require_used, train_traits
+
+        settings = TRAIT_BUDGET.full(self.budget)
+        if self.noise is not None:
+            if settings.noise_m not in (0.0, self.noise):
+                raise InputError(f"noise is {self.noise:g} m, and {settings.noise_m:g} m in the budget; give it once")
+            settings = replace(settings, noise_m=self.noise)
+        require_used(self.method, settings)
+        with one_job(Title("traits", self.method, seed=self.seed)) as report:
+            card = train_traits(
+                self.data,
+                self.out,
+                method=self.method,
+                settings=settings,
+                seed=self.seed,
+                streaming=self.streaming,
+                report=report,
+            )
+        return Outcome(
+            f"trained {self.method} on {card['windows']} windows: {self.out}", {**card, "out": str(self.out)}
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateTraits(Command):
+    """Tell how well a linear classifier reads the drivers' traits from a model's latents, on unseen episodes."""
+
+    data: Path
+    """Folder of a dataset; the test episodes are those that training with the model's seed leaves out."""
+    model: str
+    """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
+    noise: NoiseM = 0.0
+    """Standard deviation of the noise on every position, m."""
+    other_scene: bool = False
+    """Take a model that was trained in another scene, too."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.traits.datasets import evaluate_traits
+
+        use_one_thread()
+        found = evaluate_traits(self.data, self.model, noise_m=self.noise, other_scene=self.other_scene)
+        parts = {**found["by_length"], **found["by_leader"]}
+        lines = [
+            f"linear SVC         {percent(found['accuracy'], 3):>7}% of {found['windows']} windows",
+            f"majority share     {percent(found['majority_share'], 3):>7}% (of always taking the most frequent trait)",
+            f"nearest neighbours {percent(found['knn_accuracy'], 3):>7}%",
+            *(
+                f"  {_part_name(name):16} {percent(part['accuracy'], 3):>7}%"
+                for name, part in parts.items()
+                if part["windows"]
+            ),
+        ]
+        if found["error_m"] is not None:
+            lines.append(f"position error     {found['error_m']:8.4f} m (root mean square)")
+        return Outcome("\n".join(lines), found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlotTraits(Command):
+    """Draw a model's latent space beside the trajectories of some windows, and reconstructions if it makes them."""
+
+    data: Path
+    """Folder of a dataset; the test episodes are those that training with the model's seed leaves out."""
+    model: str
+    """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
+    out: Path
+    """Folder for the PNG files."""
+    noise: NoiseM = 0.0
+    """Standard deviation of the noise on every position, m."""
+    other_scene: bool = False
+    """Take a model that was trained in another scene, too."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.traits.datasets import plot_traits
+
+        require_output_folder(self.out)
+        use_one_thread()
+        files = plot_traits(self.data, self.model, self.out, noise_m=self.noise, other_scene=self.other_scene)
+        names = [str(file) for file in files]
+        return Outcome("\n".join(wrote(names)), {"files": names})
+
+
+@dataclass(frozen=True, kw_only=True)
+class InferTraits(Command):
+    """Infer the traits of the vehicles in any SUMO run: a table of latents per vehicle and window of 2 s."""
+
+    fcd: Path
+    """What sumo --fcd-output wrote (XML, CSV, Parquet), or a recorded dataset."""
+    model: str
+    """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
+    out: Path
+    """The table, .csv or .parquet."""
+    net: Path | None = None
+    """The scenario's .net.xml; without it nobody sees a leader beyond the end of a lane."""
+    vehicle_length: Annotated[float, Range(0.5, 30.0)] = 5.0
+    """Length of the vehicles in floating-car data, m."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.traits.inference import OUTSIDE, SUFFIXES, infer_traits, write_table
+
+        if self.out.exists() and self.fcd.exists() and self.out.samefile(self.fcd):
+            raise InputError(f"{self.out} holds the data themselves; choose another --out")
+        require_output_file(self.out, SUFFIXES)
+        use_one_thread()
+        table = infer_traits(self.fcd, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length)
+        write_table(table, self.out)
+        outside = float(table[OUTSIDE].mean()) if OUTSIDE in table else None
+        content = {"out": str(self.out), "windows": len(table), "vehicles": int(table["vehicle"].nunique())}
+        reach = "how many are outside is not known, since the model's card does not tell what it was trained on"
+        if outside is not None:
+            reach = f"{percent(outside)}% of the windows lie outside what the model was trained on"
+        text = f"{content['windows']} windows of {content['vehicles']} vehicles: {self.out}\n{reach}"
+        return Outcome(text, {**content, "outside": outside, "columns": list(table)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyTraits(SpreadCommand):
+    """Compare all trait methods at every position noise, an hour's work; the same command resumes it."""
+
+    after_interrupt: ClassVar[str] = RESUMES
+
+    out: FolderOrUrl = "runs/traits"
+    """Folder of the comparison, or a URL such as s3://bucket/folder."""
+    budget: TraitStudyValue = "full"
+    """Sizes of all stages; others can be given in a configuration file."""
+    workers: Processes = 2
+    """Processes of this machine at a time."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.comparisons.traits import run_trait_study
+
+        with working_folder(self.out) as out, self.workers_of(self.workers) as workers:
+            report = run_trait_study(TRAIT_STUDY.full(self.budget), out, workers=workers)
+        files = names_in(self.out, out, (report.csv_file, report.markdown_file, report.figure_file))
+        text = "\n".join([report.markdown, *wrote(files)])
+        return Outcome(text, {"results": report.table.to_dict("records"), "files": files})
+
+
+@dataclass(frozen=True)
+class Traits:
+    """Driver traits learnt from trajectories."""
+
+    command: (
+        Annotated[TrainTraits, subcommand("train")]
+        | Annotated[EvaluateTraits, subcommand("evaluate")]
+        | Annotated[PlotTraits, subcommand("plot")]
+        | Annotated[InferTraits, subcommand("infer")]
+        | Annotated[StudyTraits, subcommand("study")]
+    )
+
+
+def _part_name(name: str) -> str:
+    return name.replace("_", " ") if name[0].isalpha() else f"{name} steps"

@@ -6,7 +6,7 @@ import pytest
 from tests.simulation.scenes import LOWER
 from tint_sumo.methods.evaluation import evaluate
 from tint_sumo.methods.rules import CREEP, GO, STOP, AlwaysGo, Observation, TimeToCollision
-from tint_sumo.policy.venv import policy_venv
+from tint_sumo.policy.wrappers import policy_venv
 from tint_sumo.scenes import SCENES
 
 LOWER_Y_M, UPPER_Y_M = 2.0, 6.0

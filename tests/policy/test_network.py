@@ -12,7 +12,7 @@ from torch import Tensor
 from tint_sumo.config import PolicySettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.policy.network import AttentionExtractor, GruPolicy
-from tint_sumo.policy.trait_observation import TRUE_TRAITS
+from tint_sumo.policy.wrappers import TRUE_TRAITS
 
 from .tasks import SMALL, STREET, STREET_WITH_TRAITS, box
 

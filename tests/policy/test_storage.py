@@ -21,7 +21,7 @@ from tint_sumo.core.weights import SHA256, write_weights
 from tint_sumo.envs.episodes import action_space, observation_space
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
-from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS, trait_space
+from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS, trait_space
 
 from .tasks import SMALL
 

@@ -8,7 +8,6 @@ from gymnasium import spaces
 
 from tint_sumo.config import NO_LEADER_GAP_M
 from tint_sumo.core.errors import InputError
-from tint_sumo.policy.trait_observation import TRUE_TRAITS, TraitObservation
 from tint_sumo.policy.trait_sources import (
     ClassifierTraits,
     EncoderTraits,
@@ -17,6 +16,7 @@ from tint_sumo.policy.trait_sources import (
     StreamingTraits,
     TraitSource,
 )
+from tint_sumo.policy.wrappers import TRUE_TRAITS, TraitObservation
 from tint_sumo.traits import load
 
 from .tasks import STREET, FakeVecEnv, Memory

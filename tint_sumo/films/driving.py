@@ -12,8 +12,8 @@ from tint_sumo.envs import SceneEnv
 from tint_sumo.methods.evaluation import case_seed
 from tint_sumo.methods.loading import Contender
 from tint_sumo.policy.network import GruPolicy
-from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS
 from tint_sumo.policy.trait_sources import Frame, OracleTraits, TraitSource, one_hot
+from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
 from tint_sumo.scenes.geometry import Bools, Floats, Numbers, Poses
 from tint_sumo.simulation.simulation import Simulation
 

@@ -24,7 +24,7 @@ from tint_sumo.core.ranges import Range
 from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.policy import RecurrentPPO
-from tint_sumo.policy.venv import VenvSnapshot, memories, restore, snapshot
+from tint_sumo.policy.wrappers import VenvSnapshot, memories, restore, snapshot
 
 _GENERATOR, _HIDDEN, _STARTS = "generator", "hidden", "episode_starts"  # names of tensors
 _OBSERVATION, _MEMORY = "observation.", "memory."
@@ -79,7 +79,7 @@ def make_checkpoint(model: RecurrentPPO, recent: Iterable[str]) -> bytes:
     """Return the content of a checkpoint file; call it where a rollout starts.
 
     Args:
-        model: with environments made by ``tint_sumo.policy.venv.policy_venv``.
+        model: with environments made by ``tint_sumo.policy.wrappers.policy_venv``.
         recent: outcomes of the last episodes.
     """
     venv = model.get_env()

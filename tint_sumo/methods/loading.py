@@ -19,7 +19,7 @@ from tint_sumo.methods.rules import ACTIONS as RULE_ACTIONS
 from tint_sumo.methods.training import POLICY, TRAITS, digest
 from tint_sumo.policy import RecurrentPPO, TraitSource
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
-from tint_sumo.policy.venv import policy_venv
+from tint_sumo.policy.wrappers import policy_venv
 from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, SumocfgScene, find_scene, read_described
 from tint_sumo.traits import TraitModel
 

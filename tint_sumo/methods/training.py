@@ -32,7 +32,7 @@ from tint_sumo.methods.evaluation import CASE_SEED, require_seed
 from tint_sumo.methods.registry import Learned, find_learned
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
-from tint_sumo.policy.venv import policy_venv
+from tint_sumo.policy.wrappers import policy_venv
 from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, SumocfgScene, described, find_scene
 from tint_sumo.traits import TraitModel
 from tint_sumo.traits.storage import read_card, require_scene, save

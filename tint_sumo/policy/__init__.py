@@ -1,9 +1,7 @@
 """The navigation policy: attention and a GRU, trained with PPO on observations with driver traits."""
 
-from tint_sumo.policy.action_repeat import ActionRepeat
 from tint_sumo.policy.network import AttentionExtractor, GruPolicy
 from tint_sumo.policy.ppo import RecurrentPPO
-from tint_sumo.policy.trait_observation import TraitObservation
 from tint_sumo.policy.trait_sources import (
     ClassifierTraits,
     EncoderTraits,
@@ -12,6 +10,7 @@ from tint_sumo.policy.trait_sources import (
     StreamingTraits,
     TraitSource,
 )
+from tint_sumo.policy.wrappers import ActionRepeat, TraitObservation
 
 __all__ = [
     "ActionRepeat",

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from tint_sumo.config import PolicySettings
 from tint_sumo.core.errors import InputError, NotFiniteError
 from tint_sumo.policy.gru import ResetGru
-from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS
+from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
 
 OBSERVATION_KEYS = frozenset({"ego", "vehicles", "mask", TRAITS})
 _FAR_BELOW = -1e9  # score of an empty slot; finite, so that a street without vehicles gives no NaN

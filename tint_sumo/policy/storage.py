@@ -20,8 +20,8 @@ from tint_sumo.core.structures import FieldError, build
 from tint_sumo.core.weights import read_weights, write_weights
 from tint_sumo.envs.episodes import observation_space
 from tint_sumo.policy.network import GruPolicy
-from tint_sumo.policy.trait_observation import TRAITS, TRUE_TRAITS, trait_space
 from tint_sumo.policy.trait_sources import OracleTraits
+from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS, trait_space
 
 _NETWORK = "network"  # the card's entry with all that is needed to build the network
 

@@ -1,0 +1,213 @@
+"""The environments a policy is trained and tested in: a scene, traits in its observations, decisions now and then."""
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from tint_sumo.core.errors import InputError
+from tint_sumo.envs.batch import Snapshot
+from tint_sumo.envs.sb3 import SceneVecEnv
+from tint_sumo.policy.trait_sources import Frame, Observation, OracleTraits, TraitSource
+from tint_sumo.scenes import SumocfgScene
+
+TRAITS, TRUE_TRAITS = "traits", "true_traits"
+_NEEDED = frozenset({"ego", "vehicles", "mask"})
+
+
+class TraitObservation(VecEnvWrapper):
+    """Adds traits, (V, size) under a key, to the observations of a scene, terminal ones included.
+
+    Args:
+        venv: a ``tint_sumo.envs.sb3.SceneVecEnv``, or a wrapper around one.
+        source: where the traits come from; for one environment only.
+        key: ``"traits"``, or ``"true_traits"`` for those that only a critic may see.
+
+    Raises:
+        InputError: the environment does not observe ego, vehicles and mask.
+    """
+
+    def __init__(self, venv: VecEnv, source: TraitSource, key: str = TRAITS) -> None:
+        if not isinstance(venv.observation_space, spaces.Dict) or not set(venv.observation_space.spaces) >= _NEEDED:
+            raise InputError(
+                f"traits belong to observations with {', '.join(sorted(_NEEDED))}, as a scene's; "
+                f"this environment's space is {venv.observation_space}"
+            )
+        slots = venv.observation_space["mask"].shape
+        assert slots is not None
+        space = trait_space(slots[0], source.size)
+        super().__init__(venv, spaces.Dict({**venv.observation_space.spaces, key: space}))
+        self.source = source
+        self.key = key
+        source.attach(venv.num_envs, slots[0])
+
+    def reset(self) -> Observation:
+        observation = _dictionary(self.venv.reset())
+        self.reset_infos = self.venv.reset_infos  # a wrapper around this one reads them
+        self.source.begin(Frame(observation, self._slots(), np.ones(self.num_envs, bool)))
+        return self._with_traits(observation)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        fresh, rewards, done, infos = self.venv.step_wait()
+        observation, slots = _dictionary(fresh), self._slots()
+        ended = np.flatnonzero(done).tolist()
+        last = {env: infos[env]["terminal_observation"] for env in ended}
+        last_slots = {env: infos[env]["terminal_slots"] for env in ended}
+        self.source.advance(Frame(_continued(observation, last), _continued(slots, last_slots), done))
+        for env in ended:
+            infos[env]["terminal_observation"][self.key] = self.source.traits[env].copy()
+        if len(ended):
+            self.source.begin(Frame(observation, slots, done))
+        return self._with_traits(observation), rewards, done, infos
+
+    def _slots(self) -> dict[str, np.ndarray]:
+        slots: dict[str, np.ndarray] = self.venv.slots  # type: ignore[attr-defined]  # a wrapper asks what it wraps
+        return slots
+
+    def _with_traits(self, observation: Observation) -> Observation:
+        return {**observation, self.key: self.source.traits.copy()}
+
+
+def trait_space(max_vehicles: int, size: int) -> spaces.Box:
+    """Space of the traits of all slots, so many numbers each."""
+    return spaces.Box(-np.inf, np.inf, (max_vehicles, size), np.float32)
+
+
+def _continued(arrays: dict[str, np.ndarray], last: dict[int, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Arrays (N, ...) with what ended episodes showed last in place of what their successors show first."""
+    if not last:
+        return arrays
+    continued = {key: values.copy() for key, values in arrays.items()}
+    for env, values in last.items():
+        for key, array in continued.items():
+            array[env] = values[key]
+    return continued
+
+
+def _dictionary(observation: Any) -> Observation:
+    assert isinstance(observation, dict)
+    return observation
+
+
+_STOP = 0  # action of an episode that began within a decision
+
+
+class ActionRepeat(VecEnvWrapper):
+    """Takes each action for ``repeat`` steps and returns the sum of their rewards.
+
+    An episode that ends within a decision ends the decision; the next episode then waits, with desired speed 0, for
+    the rest of it. The controller and its safety check go on working at every step.
+
+    It differs from the environments' ``decision_s`` in two ways, and trainings depend on both. What it wraps goes step
+    by step, so that traits are inferred at each of them; an environment with ``decision_s`` shows only what is there
+    after the decision. And with ``decision_s`` the next episode begins when the decision is over, and does not wait.
+
+    Raises:
+        InputError: ``repeat`` is less than 1.
+    """
+
+    def __init__(self, venv: VecEnv, repeat: int) -> None:
+        if repeat < 1:
+            raise InputError(f"an action is taken for at least 1 step, not {repeat}")
+        super().__init__(venv)
+        self.repeat = repeat
+        self._actions = np.zeros(venv.num_envs, np.int64)
+
+    def reset(self) -> VecEnvObs:
+        return self.venv.reset()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = np.asarray(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        total = np.zeros(self.num_envs, np.float32)
+        ended = np.zeros(self.num_envs, bool)
+        last: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for _ in range(self.repeat):
+            observation, rewards, done, infos = self.venv.step(np.where(ended, _STOP, self._actions))
+            total += np.where(ended, 0.0, rewards)
+            for index in np.flatnonzero(~ended):
+                last[index] = infos[index]
+            ended |= done
+        return observation, total, ended, last
+
+
+def policy_venv(
+    num_envs: int,
+    source: TraitSource | None,
+    *,
+    action_repeat: int = 1,
+    critic_sees_true_traits: bool = False,
+    monitored: bool = False,
+    **task: Any,
+) -> VecEnv:
+    """``num_envs`` environments of a scene, with what a policy needs around them.
+
+    Args:
+        num_envs: number of environments.
+        source: where the traits in the observations come from; None leaves them out.
+        action_repeat: simulation steps per decision.
+        critic_sees_true_traits: observe the true traits, too, under a key of their own.
+        monitored: count steps and rewards of each episode for Stable-Baselines3's logger.
+        task: as in ``tint_sumo.envs.scene_env.SceneEnv``.
+    """
+    if isinstance(task.get("scene"), SumocfgScene):  # one simulation per process
+        task["scene"] = [task["scene"]] * num_envs
+    venv: VecEnv = SceneVecEnv(num_envs, tracks=source is not None and source.needs_tracks, **task)
+    if source is not None:
+        venv = TraitObservation(venv, source)
+    if critic_sees_true_traits:
+        venv = TraitObservation(venv, OracleTraits(), TRUE_TRAITS)
+    return ActionRepeat(VecMonitor(venv) if monitored else venv, action_repeat)
+
+
+@dataclass(frozen=True)
+class VenvSnapshot:
+    """Where environments made by ``policy_venv`` are, and what is remembered around them."""
+
+    episodes: list[Snapshot]
+    memories: list[dict[str, Any]]  # of each wrapper, from the outermost inwards
+
+
+def snapshot(venv: VecEnv) -> VenvSnapshot:
+    """What ``restore`` needs to come back to where the environments of ``policy_venv`` are, between two decisions."""
+    *_, base = _layers(venv)
+    assert isinstance(base, SceneVecEnv)
+    return VenvSnapshot(base.snapshot(), memories(venv))
+
+
+def memories(venv: VecEnv) -> list[dict[str, Any]]:
+    """Return a copy of what the wrappers of ``policy_venv`` remember, from the outermost inwards."""
+    *wrappers, _ = _layers(venv)
+    return copy.deepcopy([_memory(wrapper) for wrapper in wrappers])
+
+
+def restore(venv: VecEnv, there: VenvSnapshot) -> None:
+    """Go to where environments were that were made with the same arguments; they then go on as those did."""
+    *wrappers, base = _layers(venv)
+    assert isinstance(base, SceneVecEnv)
+    base.restore(there.episodes)
+    for wrapper, saved in zip(wrappers, there.memories, strict=True):
+        for name, array in _memory(wrapper).items():
+            array[...] = saved[name]
+
+
+def _layers(venv: VecEnv) -> Iterator[VecEnv]:
+    while isinstance(venv, VecEnvWrapper):
+        yield venv
+        venv = venv.venv
+    yield venv
+
+
+def _memory(wrapper: VecEnv) -> dict[str, Any]:
+    """The arrays and tensors in which a wrapper holds what it knows of the present episodes, by name."""
+    if isinstance(wrapper, TraitObservation):
+        return wrapper.source.memory()
+    if isinstance(wrapper, VecMonitor):
+        return {"returns": wrapper.episode_returns, "lengths": wrapper.episode_lengths}
+    return {}

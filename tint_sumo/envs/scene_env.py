@@ -117,7 +117,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     ## Version History
     TIntersection:
     * v1: a conservative driver that can no longer stop clear of the ego's way drives on. Before, it braked and stood so
-      close that the ego's safety check held the ego: both waited until the time limit, in up to 28 % of the episodes.
+      close that the ego's safety check held the ego: both waited until the time limit, in up to 30 % of the episodes.
       `p_conservative` takes a range; new argument `tau_s`.
     * v0: first release.
     """

@@ -1,0 +1,246 @@
+"""Numbers of the README, the documentation and docstrings: those of data/results, of cards, or measured once."""
+
+import re
+import shlex
+from datetime import date
+from pathlib import Path
+
+import pandas
+import pytest
+
+from tint_sumo import traits
+from tint_sumo.cli import main
+from tint_sumo.config import NO_LEADER_GAP_M, PPO_BUDGETS, STEP_S
+from tint_sumo.core.percentages import percent
+from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.study.results_csv import read_csv
+from tint_sumo.study.summary import Summary, at_mixes, by_title, over_all_mixes
+from tint_sumo.traits.storage import read_card
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+DOCS = ROOT / "docs"
+RESULTS = ROOT / "data" / "results"
+_TABLE = re.compile(r"(?:^\|.*\|\n)+", re.MULTILINE)
+_INFERRING = ("morton", "vae", "cross_window", "streaming", "streaming_critic", "ma")
+
+
+@pytest.mark.parametrize(
+    ("page", "head"),
+    [
+        (README, "| method | seeds | P 0.1"),
+        (DOCS / "results" / "index.md", "| method | seeds | P 0.1"),
+        (DOCS / "explanation" / "when-traits-help.md", "| method | as trained |"),
+    ],
+    ids=("README", "results", "when-traits-help"),
+)
+def test_tables_are_those_of_the_results(page: Path, head: str) -> None:
+    measured = _tables(RESULTS / "navigation.md")
+    shown = [table for table in _tables(page) if table.startswith(head)]
+    assert len(shown) == 1
+    assert shown[0] in measured
+
+
+def test_the_tables_of_the_study_say_what_the_csv_file_says() -> None:
+    rows, ceilings = read_csv(RESULTS / "navigation.csv")
+    text = re.sub(r" +", " ", (RESULTS / "navigation.md").read_text(encoding="utf-8"))
+    for row in at_mixes(rows):
+        rates = [re.escape(percent(row.rate(outcome))) + r" \[[^]]+\]" for outcome in OUTCOMES]
+        line = " \\| ".join([f"{row.conditions.p_conservative:g}", re.escape(row.title), *rates])
+        assert re.search(rf"^\| {line} \|", text, re.MULTILINE), line
+    for title, own in by_title(over_all_mixes(rows)).items():
+        cells = [f"{percent(row.rate('success'))} ({percent(row.rate('collision'))})" for row in own]
+        (line,) = [line for line in text.split("## ")[-1].splitlines() if line.startswith(f"| {title} |")]
+        assert [cell for cell in line.strip("| ").split(" | ")[1:] if cell != "-"] == cells
+    assert f"| ceiling | | {' | '.join(percent(share) for share in ceilings.values())} |" in text
+
+
+def test_the_yield_rule_s_page_has_the_study_s_rates() -> None:
+    rows, _ = read_csv(RESULTS / "navigation.csv")
+    own = {row.conditions.p_conservative: row for row in at_mixes(rows) if row.method == "always_go"}
+    cells = [" / ".join(percent(own[p].rate(outcome)) for outcome in OUTCOMES) for p in (0.25, 0.4, 0.6)]
+    assert f"| `TIntersection-v1` | {' | '.join(cells)} |" in (DOCS / "explanation" / "yield-rule.md").read_text()
+
+
+def test_differences_between_methods_are_those_of_the_study() -> None:
+    text = (RESULTS / "navigation.md").read_text(encoding="utf-8")
+    shown = re.findall(
+        r"\+[\d.]+ \[[^]]+\]", (DOCS / "explanation" / "when-traits-help.md").read_text(encoding="utf-8")
+    )
+    assert len(shown) == 2
+    for method, difference in zip(("cross-window", "oracle"), shown, strict=True):
+        (line,) = [line for line in text.splitlines() if re.match(rf"\| {method} +\| no labels ", line)]
+        assert difference == line.split("|")[4].strip()
+
+
+def test_the_table_of_trait_models_has_the_study_s_accuracies() -> None:
+    table = pandas.read_csv(RESULTS / "traits.csv").set_index(["method", "noise_m"])
+    head, _, *lines = next(
+        one for one in _tables(DOCS / "explanation" / "trait-models.md") if "| noise |" in one
+    ).split("\n")[:-1]
+    methods = re.findall("`(.*?)`", head)
+    assert len(methods) == 4 and len(lines) == 4
+    for line in lines:
+        noise, *cells = line.strip("| ").split(" | ")
+        for method, cell in zip(methods, cells, strict=True):
+            row = table.loc[(method, 0.0 if noise == "none" else float(noise.removesuffix(" m")))]
+            digits = len(cell.split(" ")[0].split(".")[1])
+            assert cell == f"{percent(row['svc_percent'] / 100, digits)} ± {row['svc_percent_sd']:.{digits}f}"
+
+
+def test_when_traits_help() -> None:
+    noisy, late, mixed = _summaries(position_noise_m=0.2), _summaries(tau_s=1.5), _summaries()
+    losses = [mixed[name] - noisy[name] for name in ("cross_window", "streaming", "streaming_critic")]
+    late_percent = [late[name] for name in _INFERRING]
+    page = _prose("docs/explanation/when-traits-help.md")
+    assert max(_summaries(position_noise_m=0.05)[name] for name in ("vae", "morton", "ma")) < 20.0
+    assert "Ma) fall below 20 %" in page
+    assert f"lose {min(losses):.0f} to {max(losses):.0f} points at 20 cm; the policy without labels loses 4." in page
+    assert round(mixed["no_labels"] - noisy["no_labels"]) == 4
+    low, high = min(late_percent), max(late_percent)
+    assert f"falls to {low:.0f} to {high:.0f} % ({late['no_attention']:.0f} % without attention), the one" in page
+    assert f"without labels to {late['no_labels']:.0f} %, and the oracle to {late['oracle']:.0f} %." in page
+    without, with_it = _spread("no_attention"), _spread("vae")
+    assert f"between the four seeds is {without} points, where it is {with_it} with attention" in page
+
+
+def test_the_limits_of_the_study() -> None:
+    rows, ceilings = read_csv(RESULTS / "navigation.csv")
+    missed = {p: 100.0 * (share - _best(rows, p)) for p, share in ceilings.items()}
+    page = _prose("docs/results/index.md")
+    assert f"is {_spread('oracle')} points for the oracle and {_spread('cross_window')} for the cross-window" in page
+    assert f"but {_spread('no_attention')} for the policy without attention" in page
+    assert f"by {missed[0.1]:.0f} points at P 0.1, and by {missed[0.25]:.0f} at P 0.25" in page
+
+
+def test_what_trait_models_leave_open() -> None:
+    table = pandas.read_csv(RESULTS / "traits.csv").set_index(["method", "noise_m"])
+    seeds = pandas.read_csv(RESULTS / "traits_seeds.csv")
+    mine, bound = table.loc["cross_window"], table.loc["classifier"]
+    page = _prose("docs/explanation/trait-models.md")
+    assert f"in percent of {seeds['windows'].mean():,.0f}"[:-3] + "000 unseen windows" in page
+    assert f"on {seeds['training_windows'].mean():,.0f}"[:-3] + "000 windows each" in page
+    full, middle, short = (f"{mine.loc[0.2, f'svc_{part}_percent']:.1f}" for part in ("20", "6_to_10", "2_to_5"))
+    assert f"right in {full} % of the full windows, in {middle} % of those of 6 to 10 steps, and in {short} %" in page
+    parts = (f"{bound.loc[0.2, f'svc_{part}_percent']:.1f}" for part in ("20", "6_to_10", "2_to_5"))
+    assert "(`classifier`: {}, {} and {})".format(*parts) in page
+    assert (bound["svc_percent"] - mine["svc_percent"]).max() < 0.1
+    assert "within 0.1 points of supervision" in page
+    others = mine[[f"svc_P{p}_percent" for p in (0.25, 0.4, 0.6)]]
+    assert others.sub(mine["svc_percent"], axis=0).abs().max(axis=None) < 0.1
+    assert "stays within 0.1 points" in page
+    noisy = seeds[(seeds["method"] == "cross_window") & (seeds["noise_m"] > 0.0)]["errors_in_most_uncertain_tenth"]
+    assert f"holds {100 * noisy.min():.0f} to {100 * noisy.max():.0f} % of all errors" in page
+    minutes = seeds["training_s"] / 60.0
+    assert f"A training took {minutes.min():.0f} to {minutes.max():.0f} minutes" in page
+
+
+def test_shipped_trait_models() -> None:
+    page = _prose("docs/explanation/trait-models.md")
+    accuracy = {name: read_card(name)["accuracy_by_noise"] for name in traits.TRAIT_METHODS}
+    assert f"right in {percent(accuracy['cross_window']['0'], 3)} % of the exact windows" in page
+    fallen = [accuracy[name]["0.05"] for name in ("vae", "morton", "classifier")]
+    assert f"fall to {percent(min(fallen))} to {percent(max(fallen))} % at 0.05 m" in page
+
+
+def test_drivers_without_classes() -> None:
+    found = pandas.read_csv(RESULTS / "traits_continuous.csv").groupby(["method", "latent_size"])
+    mean, spread = found.mean(), found.std()
+    (table,) = (one for one in _tables(DOCS / "explanation" / "trait-models.md") if "desired speed, 2 latents" in one)
+    for method in ("vae", "cross_window"):
+        columns = [(size, name) for name in ("r2_desired_speed_mps", "r2_min_gap_m") for size in (2, 4)]
+        cells = [f"{mean.loc[(method, s), name]:.3f} ± {spread.loc[(method, s), name]:.3f}" for s, name in columns]
+        assert f"| `{method}` | {' | '.join(cells)} |" in table
+
+
+def test_trait_models_in_other_scenes() -> None:
+    table = pandas.read_csv(RESULTS / "scenes.csv").groupby(["method", "trained_on", "scene"]).mean(numeric_only=True)
+    accuracy, r2 = 100.0 * table["accuracy"].unstack(), table["speed_r2"].unstack()
+    one, all_six = accuracy.xs("t_intersection", level=1), accuracy.xs("all", level=1)
+    page = _prose("docs/results/scenes.md")
+    assert one.rsub(one["t_intersection"], axis=0).max(axis=None) < 0.3
+    assert "they lose at most 0.3 points" in page
+    others = one.drop(columns="t_intersection")
+    for method, row in others.iterrows():
+        assert re.search(f"{row.min():.2f} to {row.max():.2f} % for `{method}`", page), method
+    alone = r2.xs("t_intersection", level=1)
+    assert alone.rsub(alone["t_intersection"], axis=0).abs().max(axis=None) < 0.025
+    assert "is the same within 0.02" in page
+    spans = f"{all_six.min(axis=None):.2f} to {all_six.max(axis=None):.2f} %"
+    best = r2.xs("all", level=1)
+    assert f"({spans}, R² {best.min(axis=None):.2f} to {best.max(axis=None):.2f})" in page
+    assert (all_six >= one - 0.005).all(axis=None)
+
+
+def test_settings_of_the_training() -> None:
+    full = PPO_BUDGETS["full"]
+    page = _prose("docs/explanation/training.md")
+    assert (
+        f"{full.n_envs} environments in one simulation, rollouts of {full.n_steps} decisions of "
+        f"{full.action_repeat * STEP_S:g} s, {full.n_epochs} epochs of {full.n_minibatches} minibatches, learning rate "
+        f"{full.learning_rate:g} and entropy weight {full.ent_coef:g}, both falling linearly to "
+        f"{full.final_ent_coef:g}, discount {full.gamma:g}, weight of the value loss {full.vf_coef:g}, and "
+        f"{full.total_steps / 1e6:g} million decisions"
+    ) in page
+    assert f"that gap is {NO_LEADER_GAP_M:g} m" in _prose("docs/explanation/label-leak.md")
+
+
+_ONCE = pandas.read_csv(RESULTS / "once.csv")
+
+
+def test_what_was_measured_once_stands_where_the_list_of_it_says() -> None:
+    assert not _ONCE.isna().any(axis=None)
+    for one in _ONCE.itertuples():
+        assert str(one.shown) in _prose(str(one.page)), one
+        date.fromisoformat(str(one.published))
+
+
+@pytest.mark.parametrize(
+    "command", sorted({one for how in _ONCE["how_to_repeat"] for one in re.findall("`(.*?)`", how)})
+)
+def test_how_it_is_repeated_can_be_typed(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    program, *words = shlex.split(command)
+    if program == "python":
+        assert (ROOT / words[0]).exists()
+    else:
+        assert program == "tint-sumo"
+        assert main([*words, "--print-config"]) == 0, capsys.readouterr().err
+
+
+def _summaries(**conditions: float) -> dict[str, float]:
+    """Success of each method's trained policies over all mixes, %, in conditions that differ as given."""
+    rows, _ = read_csv(RESULTS / "navigation.csv")
+    wanted = {"position_noise_m": 0.0, "tau_s": 1.0, "percent": 100, **conditions}
+    return {
+        row.method: 100.0 * row.rate("success")
+        for row in over_all_mixes(rows)
+        if all(getattr(row.resolved, name) == value for name, value in wanted.items())
+    }
+
+
+def _spread(method: str) -> str:
+    """Standard deviation of a method's success between seeds at P 0.4, percentage points."""
+    rows, _ = read_csv(RESULTS / "navigation.csv")
+    (spread,) = (row.spread("success") for row in at_mixes(rows) if row.method == method and _mix(row) == 0.4)
+    assert spread is not None
+    return f"{100.0 * spread:.1f}"
+
+
+def _best(rows: list[Summary], p_conservative: float) -> float:
+    return max(row.rate("success") for row in at_mixes(rows) if _mix(row) == p_conservative)
+
+
+def _mix(row: Summary) -> float:
+    assert isinstance(row.conditions.p_conservative, float)
+    return row.conditions.p_conservative
+
+
+def _prose(page: str) -> str:
+    """Return a page's text in one line."""
+    return " ".join((ROOT / page).read_text(encoding="utf-8").split())
+
+
+def _tables(page: Path) -> list[str]:
+    """The tables of a page, with single spaces."""
+    text = re.sub(r" +", " ", page.read_text(encoding="utf-8"))
+    return [re.sub(r"-{3,}", "---", table) for table in _TABLE.findall(text)]

@@ -12,7 +12,7 @@ import sumo
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
-from tint_sumo.dataset.fcd_reading import read_fcd
+from tint_sumo.dataset.fcd import read_fcd
 from tint_sumo.dataset.schema import TRAJECTORIES
 from tint_sumo.dataset.tracks import read_tracks
 

@@ -19,8 +19,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_json
 from tint_sumo.dataset.schema import MANIFEST, SCHEMA_VERSION
 from tint_sumo.dataset.shards import count_windows, write_tables
-from tint_sumo.dataset.window_file import WindowFile, window_file
-from tint_sumo.dataset.windows import Windows
+from tint_sumo.dataset.windows import WindowFile, Windows, window_file
 from tint_sumo.traits import TRAIT_METHODS, datasets, training
 from tint_sumo.traits.datasets import train_traits
 from tint_sumo.traits.storage import read_card

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from tint_sumo.config import NO_LEADER_GAP_M
-from tint_sumo.dataset.window_file import WindowFile
-from tint_sumo.dataset.windows import Windows
+from tint_sumo.dataset.windows import WindowFile, Windows
 
 
 @dataclass(frozen=True)

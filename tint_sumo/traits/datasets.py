@@ -11,8 +11,8 @@ from tint_sumo import traits
 from tint_sumo.config import CONSERVATIVE_LABEL, LATENT_SIZE, TRAIT_BUDGETS, TraitSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Report, silent
-from tint_sumo.dataset.window_file import WindowFile, window_file
 from tint_sumo.dataset.windows import (
+    WindowFile,
     Windows,
     drivers_of,
     load_labels,
@@ -21,6 +21,7 @@ from tint_sumo.dataset.windows import (
     read_manifest,
     read_training_windows,
     split_by_episode,
+    window_file,
 )
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
 from tint_sumo.traits.figures import plot_latents, plot_reconstructions

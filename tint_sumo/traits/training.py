@@ -29,8 +29,7 @@ from tint_sumo.core.files import claim_folder
 from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.training_log import open_log
-from tint_sumo.dataset.window_file import WindowFile
-from tint_sumo.dataset.windows import Windows
+from tint_sumo.dataset.windows import WindowFile, Windows
 from tint_sumo.traits.batches import TrainingWindows, WindowBatch
 from tint_sumo.traits.input_range import InputRange
 from tint_sumo.traits.model import TraitModel, find_trait_method

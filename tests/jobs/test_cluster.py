@@ -375,7 +375,7 @@ def test_a_command_uses_a_cluster_elsewhere(elsewhere: str, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "ray://127.0.0.1", "nowhere"])
 def test_no_cluster_at_an_address(address: str) -> None:
-    with pytest.raises(InputError, match=f"^no Ray cluster answers at {address} .*; check --address$"):
+    with pytest.raises(InputError, match=f"^no Ray cluster answers at {address} .*; check `address`$"):
         ray_cluster(address).__enter__()
 
 

@@ -215,7 +215,7 @@ def test_a_zip_file_is_read_with_permission_alone(run: Path, tmp_path: Path) -> 
     for file in (run / "policy.zip", tmp_path / "absent.zip"):
         line = refused(file)
         assert str(file) in line
-        assert "run any code" in line and "give the .safetensors file beside it, or --allow-pickle" in line
+        assert "run any code" in line and "give the .safetensors file beside it, or `allow_pickle`" in line
     assert "no file" in refused(tmp_path / "absent.zip", allow_pickle=True)
 
 
@@ -298,7 +298,7 @@ def test_a_policy_of_another_version_of_its_scene_is_refused_unless_the_scene_is
         shutil.copy(run / f"policy{suffix}", tmp_path / f"policy{suffix}")
     card = json.loads((tmp_path / "policy.json").read_text())
     (tmp_path / "policy.json").write_text(json.dumps(card | {"scene_digest": "of another day"}))
-    with pytest.raises(InputError, match="another version of the scene t_intersection; say --scene t_intersection"):
+    with pytest.raises(InputError, match="another version of the scene t_intersection; give its name as `scene`"):
         load_policy(tmp_path)
     assert load_policy(tmp_path, scene=T_INTERSECTION).scene == T_INTERSECTION
 
@@ -310,6 +310,6 @@ def test_a_policy_of_all_scenes_needs_one_to_drive_in(run: Path, tmp_path: Path)
     (tmp_path / "policy.json").write_text(
         json.dumps(card | {"scene": ALL_SCENES, "scene_digest": digest_of(ALL_SCENES)})
     )
-    with pytest.raises(InputError, match="was trained in all scenes; say --scene NAME"):
+    with pytest.raises(InputError, match="was trained in all scenes; give the `scene`"):
         load_policy(tmp_path)
     assert load_policy(tmp_path, scene="on_ramp").scene == "on_ramp"

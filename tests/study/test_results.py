@@ -83,7 +83,7 @@ def test_a_result_that_names_no_set_of_cases_is_of_the_reported_ones(study: Path
 
 
 def test_no_results(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no results in .*; run the study first: tint-sumo study run --out"):
+    with pytest.raises(InputError, match=r"no results in .*; run the study first"):
         write_report(tmp_path)
     assert not list(tmp_path.iterdir())
 

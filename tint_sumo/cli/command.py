@@ -1,9 +1,10 @@
 """Base classes of commands. A command is a dataclass whose fields are its flags."""
 
+import re
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -40,6 +41,11 @@ class Command:
     def run(self) -> Outcome:
         raise NotImplementedError
 
+    def with_flags(self, message: str) -> str:
+        """Show the flags of this command in an error's message, which has arguments between backticks."""
+        names = "|".join(field.name for field in fields(self))
+        return re.sub(f"`({names})`", lambda found: flag_of(found[1]), message)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SpreadCommand(Command):
@@ -55,9 +61,9 @@ class SpreadCommand(Command):
     def workers_of(self, workers: int, gpus_per_job: float = 0.0) -> "Iterator[Workers]":
         """In the block, what does the work: so many processes, or the cluster."""
         if self.executor == "local":
-            for flag, value, default in (("address", self.address, "auto"), ("gpus-per-job", gpus_per_job, 0.0)):
+            for name, value, default in (("address", self.address, "auto"), ("gpus_per_job", gpus_per_job, 0.0)):
                 if value != default:
-                    raise InputError(f"--{flag} goes with --executor ray; add that, or leave it out")
+                    raise InputError(f"{flag_of(name)} goes with --executor ray; add that, or leave it out")
             yield workers
             return
         if workers != getattr(type(self), "workers", workers):  # a command without that flag uses no processes
@@ -72,6 +78,11 @@ class SpreadCommand(Command):
             if found.dashboard_url:
                 print(f"Ray's dashboard: http://{found.dashboard_url}", file=sys.stderr)
             yield found
+
+
+def flag_of(name: str) -> str:
+    """Return the flag of a field of a command."""
+    return "--" + name.replace("_", "-")
 
 
 def names_in(out: str, folder: Path, files: Iterable[Path | None]) -> list[str]:

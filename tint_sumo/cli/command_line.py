@@ -14,7 +14,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
 from tint_sumo.cli.bench import Bench
-from tint_sumo.cli.command import Command
+from tint_sumo.cli.command import Command, flag_of
 from tint_sumo.cli.configuration import commands_named, config_of, read_command, write_command
 from tint_sumo.cli.dataset import Dataset, Record
 from tint_sumo.cli.models import Models
@@ -79,25 +79,24 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     """Run the command that the words of a command line say, and print what comes out."""
-    after_interrupt = Command.after_interrupt
     if words[:1] == ["--print-completion"] and words[1:] in ([shell] for shell in get_args(Shell)):
         print(_completion_script(words[1]), end="")
         return 0
     if words == ["--version"]:
         print(version_text())
         return 0
+    command = Command()
     try:
         command = parse(words)
-        after_interrupt = command.after_interrupt
         if command.print_config:
             print(write_command(command), end="")
             return 0
         with made_by(Origin(tuple(words), partial(write_command, command))):
             outcome = command.run()
     except (InputError, JobError) as error:
-        return _refuse(str(error), 2 if isinstance(error, InputError) else 1)
+        return _refuse(command.with_flags(str(error)), 2 if isinstance(error, InputError) else 1)
     except KeyboardInterrupt:
-        print("\ntint-sumo: interrupted; all files are whole" + after_interrupt, file=sys.stderr)
+        print("\ntint-sumo: interrupted; all files are whole" + command.after_interrupt, file=sys.stderr)
         return 130
     print(redact(outcome.text))
     if command.json:
@@ -147,7 +146,7 @@ def _require_paths(command: Command) -> None:
     for name, value in vars(command).items():
         if isinstance(value, Path) and value.parts and value.parts[0].endswith(":"):
             raise InputError(
-                f"--{name.replace('_', '-')} of this command is a path on this machine, not a URL; only record, traits "
+                f"{flag_of(name)} of this command is a path on this machine, not a URL; only record, traits "
                 "study, study run and policy sweep write to URLs"
             )
 

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from tyro.conf import Positional, Suppress, arg, subcommand
 
-from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, wrote
+from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, flag_of, wrote
 from tint_sumo.cli.values import SCENES, FolderOrUrl, PopulationValue, SceneValue, ShareFlag, share_of
 from tint_sumo.config import TrafficSeed, WindowCount
 from tint_sumo.core.errors import InputError
@@ -63,17 +63,18 @@ class Record(SpreadCommand):
         return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
 
     def _require_nothing_but_the_configuration(self) -> None:
-        flags = ["p_conservative", "population", "format"]
+        names = ["p_conservative", "population", "format"]
         other = "the sumocfg of a scene"
         if self.executor != "local":
             raise InputError("a .sumocfg is on this machine alone; use --executor local")
         if self.sumocfg is not None:
-            flags.append("scene")
+            names.append("scene")
             other = "--sumocfg"
-        for flag in flags:
-            if getattr(self, flag) != getattr(Record, flag):
-                name = flag.replace("_", "-")
-                raise InputError(f"--{name} does not go with {other}, which tells all of the traffic; leave it out")
+        for name in names:
+            if getattr(self, name) != getattr(Record, name):
+                raise InputError(
+                    f"{flag_of(name)} does not go with {other}, which defines all of the traffic; leave it out"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +94,7 @@ class InspectDataset(Command):
         from tint_sumo.dataset.windows import read_manifest
 
         if self.figure is not None:
-            require_output_file(self.figure, PICTURE_SUFFIXES, "--figure")
+            require_output_file(self.figure, PICTURE_SUFFIXES, "figure")
         verified = verify(self.data, read_manifest(self.data)) if self.verify else None
         found = inspect(self.data)
         text = report(found)

@@ -84,7 +84,7 @@ def _read_results(out: Path) -> list[dict[str, Any]]:
     files = sorted((out / RESULTS).glob("*.json"))
     contents = [_read_result(file) for file in files]
     if not any(content["kind"] == "comparison" for content in contents):
-        raise InputError(f"no results in {out}; run the study first: tint-sumo traits study --out {out}")
+        raise InputError(f"no results in {out}; run the comparison first")
     return contents
 
 

@@ -12,7 +12,11 @@ _SHOWN.maxstring = _SHOWN.maxother = 80
 
 
 class InputError(ValueError):
-    """Bad input: one line that says what is wrong and how to mend it. The command line exits with code 2 on it."""
+    """Bad input: one line that says what is wrong and how to mend it. The command line exits with code 2 on it.
+
+    An argument that is to be changed stands between backticks, as in "choose another `out`"; the command line shows its
+    flag there.
+    """
 
 
 class NotFiniteError(InputError):

@@ -108,7 +108,7 @@ def damaged(path: Path, what: str, error: object) -> InputError:
     return InputError(f"{what}: {path} is damaged ({error}); restore it, or remove it and repeat the command")
 
 
-def require_output_file(file: Path, suffixes: Sequence[str], flag: str = "--out") -> None:
+def require_output_file(file: Path, suffixes: Sequence[str], argument: str = "out") -> None:
     """Check, before the work begins, that a command can write a file, and may.
 
     Raises:
@@ -117,14 +117,14 @@ def require_output_file(file: Path, suffixes: Sequence[str], flag: str = "--out"
     """
     if file.suffix.lower() not in suffixes:
         allowed = " or ".join(part for part in (", ".join(suffixes[:-1]), suffixes[-1]) if part)
-        raise InputError(f"{file} must end in {allowed}; choose another {flag}")
+        raise InputError(f"{file} must end in {allowed}; choose another `{argument}`")
     if file.is_dir() or not _nearest_entry(file.parent).is_dir():
-        raise InputError(f"{file} cannot be a file there; choose another {flag}")
-    _require_no_run(file, flag)
+        raise InputError(f"{file} cannot be a file there; choose another `{argument}`")
+    _require_no_run(file, argument)
     _require_writable(file.parent)
 
 
-def require_output_folder(folder: Path, flag: str = "--out") -> None:
+def require_output_folder(folder: Path, argument: str = "out") -> None:
     """Check, before the work begins, that a command can write files into a folder that belongs to no run.
 
     Raises:
@@ -132,17 +132,17 @@ def require_output_folder(folder: Path, flag: str = "--out") -> None:
         OSError: it cannot be written to, or has no room.
     """
     if not _nearest_entry(folder).is_dir():
-        raise InputError(f"{folder} is a file, not a folder, or lies below one; choose another {flag}")
-    _require_no_run(folder, flag)
+        raise InputError(f"{folder} is a file, not a folder, or lies below one; choose another `{argument}`")
+    _require_no_run(folder, argument)
     _require_writable(folder)
 
 
-def _require_no_run(path: Path, flag: str) -> None:
+def _require_no_run(path: Path, argument: str) -> None:
     """Raise InputError if ``path`` is the folder of a run or lies in one: nobody else's files may be there."""
     resolved = path.resolve()
     for folder in (resolved, *resolved.parents):
         if (folder / RUN_FILE).exists():
-            raise InputError(f"{path} lies in {folder}, which belongs to a run; choose another {flag}")
+            raise InputError(f"{path} lies in {folder}, which belongs to a run; choose another `{argument}`")
 
 
 def _require_writable(folder: Path) -> None:
@@ -155,7 +155,7 @@ def _require_writable(folder: Path) -> None:
     try:
         str(folder.resolve()).encode()
     except UnicodeEncodeError:
-        raise InputError(f"the name {str(folder.resolve())!a} is no text in UTF-8; choose another --out") from None
+        raise InputError(f"the name {str(folder.resolve())!a} is no text in UTF-8; choose another `out`") from None
     try:
         with TemporaryFile(dir=_nearest_entry(folder)) as file:
             os.posix_fallocate(file.fileno(), 0, MIN_ROOM_BYTES)
@@ -193,7 +193,7 @@ def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bo
     try:
         lock.acquire()
     except Timeout:
-        raise InputError(f"another process is working in {folder}; wait for it or choose another --out") from None
+        raise InputError(f"another process is working in {folder}; wait for it or choose another `out`") from None
     try:
         _require_home(folder, wanted)
         for partial in folder.rglob(".*.partial"):
@@ -211,17 +211,17 @@ def _require_home(folder: Path, wanted: Mapping[str, Any]) -> None:
     """Raise InputError unless ``folder`` is absent, empty, or the home of the run ``wanted``."""
     run_file = folder / RUN_FILE
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is a file, not a folder; choose another --out")
+        raise InputError(f"{folder} is a file, not a folder; choose another `out`")
     if run_file.exists():
         held = read_json(run_file, "run settings")
         if held != wanted:
             changed = sorted(dotted((key,)) for key in held.keys() | wanted.keys() if held.get(key) != wanted.get(key))
             raise InputError(
                 f"{folder} already holds another run (different: {', '.join(changed)}); "
-                "choose another --out or remove the folder"
+                "choose another `out` or remove the folder"
             )
     elif folder.exists() and any(_is_strange(entry) for entry in folder.iterdir()):
-        raise InputError(f"{folder} already holds other files; choose another --out or an empty folder")
+        raise InputError(f"{folder} already holds other files; choose another `out` or an empty folder")
 
 
 def _is_strange(entry: Path) -> bool:

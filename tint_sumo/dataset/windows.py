@@ -318,7 +318,7 @@ def window_file(parts: Iterable[Windows], folder: Path) -> Iterator[WindowFile]:
                     left = left[file.write(left) :]
             except OSError as error:
                 raise InputError(
-                    f"{home} has no room for the windows ({error.strerror}); free some or choose another --out"
+                    f"{home} has no room for the windows ({error.strerror}); free some or choose another `out`"
                 ) from None
         yield WindowFile(file.fileno())
 

@@ -104,7 +104,7 @@ def _require_answer(address: str) -> None:
     try:
         socket.create_connection((host, int(port)), ANSWER_S).close()
     except (OSError, ValueError) as error:
-        raise InputError(f"no Ray cluster answers at {address} ({error}); check --address") from None
+        raise InputError(f"no Ray cluster answers at {address} ({error}); check `address`") from None
 
 
 def _resources() -> dict[str, float]:

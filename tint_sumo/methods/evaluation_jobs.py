@@ -119,7 +119,7 @@ def evaluate_on(
     """
     require_cases(episodes, seed)
     if isinstance(find_scene(contender.scene), SumocfgScene):
-        raise InputError("the .sumocfg of a scene is on this machine alone; use --executor local")
+        raise InputError("the .sumocfg of a scene is on this machine alone; evaluate here, not on a cluster")
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as folder:
         out = Path(folder)
         named = _copy_model(model, out)

@@ -86,7 +86,7 @@ def load_policy(name_or_path: str | Path, *, scene: AnyScene | None = None, allo
     found = replace(found, name=str(name_or_path))
     if scene is None:
         if found.scene == ALL_SCENES:
-            raise InputError(f"{name_or_path} was trained in all scenes; say --scene NAME to choose one")
+            raise InputError(f"{name_or_path} was trained in all scenes; give the `scene`")
         _require_same_roads(stem, found)
         return found
     return _in_scene(found, scene)
@@ -116,10 +116,10 @@ def _in_scene(contender: Contender, scene: AnyScene) -> Contender:
 def _require_same_roads(stem: Path, found: Contender) -> None:
     """Raise InputError if a policy was trained in another version of its scene."""
     if read_policy_card(stem).get("scene_digest") != find_scene(found.scene).digest:
-        say = f"say --scene {found.scene}" if isinstance(found.scene, str) else "give the scene in a --config file"
+        scene = "its name" if isinstance(found.scene, str) else "its definition"
         raise InputError(
             f"{card_file(stem)}: this policy was trained in another version of the scene {found.scene_name}; "
-            f"{say} to use it all the same"
+            f"give {scene} as `scene` to use it all the same"
         )
 
 
@@ -127,7 +127,7 @@ def _load_zip(file: Path, allow_pickle: bool) -> RecurrentPPO:
     if not allow_pickle:
         raise InputError(
             f"{file} is a pickle, which can run any code when it is read; give the .safetensors file beside it, "
-            "or --allow-pickle if you trust the file"
+            "or `allow_pickle` if you trust the file"
         )
     print(f"reading {file}, a pickle: it can run any code", file=sys.stderr)
     with preserved_random_state():

@@ -205,7 +205,7 @@ class StreamingTraits(TraitSource):
         if not isinstance(model, CrossWindow):
             raise InputError(
                 f"streaming needs the posteriors of a cross_window model, not of {model.method}; "
-                "give a model trained with --method cross_window"
+                "give a trait model of the method cross_window"
             )
         self.model = model
 

@@ -52,7 +52,7 @@ def write_scene(folder: Path, scene: Scene, replicas: int) -> list[Path]:
     texts = scene_files(scene, replicas)
     foreign = [file for file in texts if (folder / file).exists() and not _is_ours(folder / file)]
     if foreign:
-        raise InputError(f"{folder} holds a {foreign[0]} that tint-sumo did not write; choose another --out")
+        raise InputError(f"{folder} holds a {foreign[0]} that tint-sumo did not write; choose another `out`")
     for file, text in texts.items():
         write_text(folder / file, text)
     return [folder / file for file in texts]

@@ -119,7 +119,7 @@ def read_results(out: Path) -> list[Result]:
     """
     files = sorted((out / RESULTS).glob("*.json"))
     if not files:
-        raise InputError(f"no results in {out}; run the study first: tint-sumo study run --out {out}")
+        raise InputError(f"no results in {out}; run the study first")
     results = [Result.read(file) for file in files]
     if any(one.case_set != CASES for one in results):
         raise InputError(f"{out} is part of a sweep, whose cases no study reports; read sweep.md in the folder above")

@@ -218,5 +218,5 @@ def _require_unseen(data: Path, model: str | Path) -> None:
     alike = all(trained_on.get(key) == here[key] for key in ("scene", "p_conservative", "population", "seed"))
     if alike and trained_on.get("windows") != here["windows"]:
         raise InputError(
-            f"{data} has episodes that {model} was trained on; record another dataset with --seed {here['seed'] + 1}"
+            f"{data} has episodes that {model} was trained on; record another dataset with seed {here['seed'] + 1}"
         )

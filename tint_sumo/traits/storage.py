@@ -68,7 +68,7 @@ def require_scene(name_or_path: str | Path, scene: str, digest: str, user: str) 
     if data.get("scene_digest", digest) != digest:
         raise InputError(
             f"trait model {name_or_path} was trained in scene {data.get('scene')}, {user} is of scene {scene}; "
-            "say --other-scene to use it all the same"
+            "give `other_scene` to use it all the same"
         )
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from tint_sumo.config import NO_LEADER_GAP_M
 from tint_sumo.core.errors import InputError
+from tint_sumo.dataset.windows import cut_windows
 from tint_sumo.policy.trait_sources import (
     ClassifierTraits,
     EncoderTraits,
@@ -18,6 +18,8 @@ from tint_sumo.policy.trait_sources import (
 )
 from tint_sumo.policy.wrappers import TRUE_TRAITS, TraitObservation
 from tint_sumo.traits import load
+from tint_sumo.traits.evaluation import encode_windows
+from tint_sumo.traits.streaming import fuse_so_far
 
 from .tasks import STREET, FakeVecEnv, Memory
 
@@ -26,7 +28,7 @@ class Seen(NamedTuple):
     """A vehicle on its route."""
 
     position_m: float
-    gap_m: float = math.inf
+    gap_m: float = math.nan
     passed: bool = False
 
 
@@ -274,12 +276,11 @@ def test_streaming_is_the_posterior_of_the_track_so_far() -> None:
     for slot, start, speed_m in ((3, 0, 0.2), (0, 13, 0.24)):
         for step in (start + 1, start + 19, start + 20, start + 21, start + 38):
             count = step - start + 1
-            states = torch.zeros(1, count, 2)
-            states[0, :, 0] = speed_m * (torch.arange(count) % 20)  # from each window's first position
-            states[0, :, 1] = NO_LEADER_GAP_M if slot == 3 else torch.from_numpy(gap_m[start : step + 1])
-            mean, log_var = model.encode(states, torch.tensor([count]))
-            np.testing.assert_allclose(traits[step, 0, slot, :2], mean[0], atol=2e-3)
-            np.testing.assert_allclose(traits[step, 0, slot, 2:4], torch.exp(0.5 * log_var[0]), atol=2e-3)
+            gaps_m = np.full(count, np.nan) if slot == 3 else gap_m[start : step + 1]
+            windows = cut_windows(np.zeros(count, int), np.zeros(count, int), speed_m * np.arange(count), gaps_m)
+            expected = fuse_so_far(encode_windows(model, windows), windows.driver)
+            np.testing.assert_allclose(traits[step, 0, slot, :2], expected.mean[-1], atol=2e-3)
+            np.testing.assert_allclose(traits[step, 0, slot, 2:4], expected.std[-1], atol=2e-3)
             assert traits[step, 0, slot, 4] == pytest.approx(count / 100)
 
 

@@ -12,10 +12,10 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.schema import TRAJECTORIES
 from tint_sumo.dataset.windows import load_windows
 from tint_sumo.traits import TRAIT_METHODS, load
-from tint_sumo.traits.cross_window import fuse
 from tint_sumo.traits.evaluation import encode_windows
 from tint_sumo.traits.inference import infer_traits, write_table
 from tint_sumo.traits.storage import save
+from tint_sumo.traits.streaming import evidence, posterior
 
 NET = shipped("sumo_net") / "tint.net.xml"
 KEYS = ["vehicle", "window", "start_s", "end_s", "steps", "has_leader"]
@@ -74,13 +74,11 @@ def test_running_fusion_is_the_fusion_of_the_windows_so_far(dataset: Path, cross
     for _, part in table[table["vehicle"].isin(longest)].groupby("vehicle", observed=True):
         assert len(part) > 3
         for windows in range(1, len(part) + 1):
-            mean, std = (torch.tensor(part[columns].to_numpy()[None, :windows]) for columns in (LATENTS, STDS))
-            fused, log_var = fuse(mean, 2 * std.log(), torch.ones(1, windows, dtype=torch.bool))
+            mean, std = (torch.tensor(part[columns].to_numpy()[:windows]) for columns in (LATENTS, STDS))
+            fused, fused_std = posterior(evidence(mean, 2 * std.log()).sum(dim=1))
             now = part.iloc[windows - 1]
-            np.testing.assert_allclose(now[["fused_latent_1", "fused_latent_2"]].astype(float), fused[0], rtol=1e-4)
-            np.testing.assert_allclose(
-                now[["fused_std_1", "fused_std_2"]].astype(float), (0.5 * log_var[0]).exp(), rtol=1e-4
-            )
+            np.testing.assert_allclose(now[["fused_latent_1", "fused_latent_2"]].astype(float), fused, rtol=1e-4)
+            np.testing.assert_allclose(now[["fused_std_1", "fused_std_2"]].astype(float), fused_std, rtol=1e-4)
 
 
 def test_a_vehicle_that_comes_back_goes_on_counting(tmp_path: Path, cross_window: Path) -> None:

@@ -18,8 +18,8 @@ from tint_sumo.core.checkpoints import CHECKPOINT_FILE
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_json
 from tint_sumo.dataset.schema import MANIFEST, SCHEMA_VERSION
-from tint_sumo.dataset.shards import count_windows, write_tables
-from tint_sumo.dataset.windows import WindowFile, Windows, window_file
+from tint_sumo.dataset.shards import write_tables
+from tint_sumo.dataset.windows import WindowFile, Windows, count_windows, window_file
 from tint_sumo.traits import TRAIT_METHODS, datasets, training
 from tint_sumo.traits.datasets import train_traits
 from tint_sumo.traits.storage import read_card

@@ -17,7 +17,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, WINDOW_STEPS
+from tint_sumo.config import NO_LEADER_GAP_M, WINDOW_STEPS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.file_changes import write_files
 from tint_sumo.core.files import claim_folder, whole_file, write_json
@@ -37,7 +37,7 @@ from tint_sumo.dataset.schema import (
     shard_number,
     shard_path,
 )
-from tint_sumo.dataset.windows import read_manifest
+from tint_sumo.dataset.windows import count_windows, read_manifest
 from tint_sumo.jobs import Executor, Work, Workers, executor_of
 
 EPISODE_STEPS = 500
@@ -219,9 +219,3 @@ def _write(file: Path, frame: pd.DataFrame, schema: pa.Schema, metadata: Mapping
             use_dictionary=[name for name in table.column_names if name not in _FLOATS],
             use_byte_stream_split=[name for name in table.column_names if name in _FLOATS],
         )
-
-
-def count_windows(trajectories: pd.DataFrame) -> int:
-    """Number of windows in whole tracks: pieces of 20 steps, and remainders of at least 2."""
-    steps = trajectories.groupby(["episode", "vehicle"]).size().to_numpy()
-    return int((steps // WINDOW_STEPS + (steps % WINDOW_STEPS >= MIN_WINDOW_STEPS)).sum())

@@ -126,19 +126,43 @@ def cut_windows(
     position_m: NDArray[np.floating],
     gap_m: NDArray[np.floating],
 ) -> Windows:
-    """Windows from rows (M,) that are sorted by driver and time; ``gap_m`` is NaN without a leader."""
-    step = steps_in_window(driver)
-    window = np.cumsum(step == 0) - 1
-    length = np.bincount(window)
-    first = np.flatnonzero(step == 0)
+    """Return the windows of rows (M,) that are sorted by driver and time; ``gap_m`` is NaN without a leader."""
+    first, length = window_rows(driver)
+    valid = valid_steps(length)
+    row = np.where(valid, first[:, None] + np.arange(WINDOW_STEPS), first[:, None])
+    states = np.zeros((*valid.shape, 2), np.float32)
+    states[..., 0] = position_m[row] - position_m[first, None]
+    states[..., 1] = np.where(valid, capped(gap_m)[row], 0.0)
+    has_leader = ~np.isnan(gap_m)[row].any(axis=1)
+    return Windows(states, length, driver[first], episode[first].astype(np.int64), has_leader)
 
-    states = np.zeros((len(length), WINDOW_STEPS, 2), np.float32)
-    states[window, step, 0] = position_m - position_m[first][window]
-    states[window, step, 1] = np.fmin(gap_m, NO_LEADER_GAP_M)
-    leaderless = np.bincount(window, weights=np.isnan(gap_m)) > 0
-    return Windows(states, length, driver[first], episode[first].astype(np.int64), ~leaderless)[
-        length >= MIN_WINDOW_STEPS
-    ]
+
+def window_rows(driver: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return each window's first row (N,) and its number of steps (N,), in rows (M,) sorted by driver and time.
+
+    A driver's windows of 20 steps follow each other; what is left is a window if it has at least 2.
+    """
+    row = np.arange(len(driver))
+    begins = np.r_[True, driver[1:] != driver[:-1]][: len(driver)]
+    first = np.flatnonzero((row - np.maximum.accumulate(np.where(begins, row, 0))) % WINDOW_STEPS == 0)
+    length = np.diff(first, append=len(driver))
+    whole = length >= MIN_WINDOW_STEPS
+    return first[whole], length[whole]
+
+
+def count_windows(trajectories: pd.DataFrame) -> int:
+    """Return the number of windows in rows of trajectories, sorted by episode, vehicle and time."""
+    return len(window_rows(_driver_numbers(trajectories))[0])
+
+
+def valid_steps(length: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which of 20 steps windows of these lengths (N,) have, (N, 20)."""
+    return np.asarray(np.arange(WINDOW_STEPS) < length[:, None])
+
+
+def capped(gap_m: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return gaps to leaders, NaN without one, as trait models are given them: 20 m at most, and 20 m without one."""
+    return np.asarray(np.fmin(gap_m, NO_LEADER_GAP_M))
 
 
 def joined(parts: Sequence[Windows]) -> Windows:
@@ -150,13 +174,6 @@ def joined(parts: Sequence[Windows]) -> Windows:
     ]
     columns = {field.name: np.concatenate([getattr(one, field.name) for one in moved]) for field in fields(Windows)}
     return Windows(**columns)
-
-
-def steps_in_window(driver: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How many steps of its window precede each row (M,), the rows sorted by driver and time."""
-    starts_track = np.r_[True, driver[1:] != driver[:-1]]
-    track_start = np.flatnonzero(starts_track)[np.cumsum(starts_track) - 1]
-    return np.asarray((np.arange(len(driver)) - track_start) % WINDOW_STEPS)
 
 
 def load_labels(folder: Path, windows: OfDrivers) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import torch
 
-from tint_sumo.config import LATENT_SIZE, NO_LEADER_GAP_M, STEP_S, WINDOW_STEPS
+from tint_sumo.config import LATENT_SIZE, STEP_S, WINDOW_STEPS
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.windows import cut_windows
 from tint_sumo.traits.classifier import Classifier
@@ -229,7 +229,7 @@ class StreamingTraits(TraitSource):
         """Take one more step of the tracks in some environments."""
         present, tracks = frame.present[envs], self._tracks[envs]
         position_m = frame.slots["position_m"][envs].astype(np.float32)
-        gap_m = np.fmin(frame.slots["gap_m"][envs], NO_LEADER_GAP_M).astype(np.float32)
+        gap_m = frame.slots["gap_m"][envs]
         self._stream.forget(tracks[~present])
         mean, std = self._stream.advance(tracks[present], position_m[present], gap_m[present])
         age = self._stream.steps[tracks[present]] * np.float32(STEP_S / _AGE_SCALE_S)

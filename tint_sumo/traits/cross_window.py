@@ -4,9 +4,8 @@ import math
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from tint_sumo.config import LATENT_SIZE, MIN_WINDOW_STEPS, WINDOW_STEPS, TraitSettings
+from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import kl_divergence, sample
 from tint_sumo.traits.model import FEATURES, TraitModel, register, valid_steps
@@ -29,7 +28,7 @@ class CrossWindow(TraitModel):
     q(z|A) is the uncertainty that A leaves (the maximum-likelihood objective of neural processes, Foong et al., 2020):
     an evidence lower bound would rather have a sure latent between two candidates.
 
-    Longer tracks are cut into windows, whose Gaussians multiply (``fuse``).
+    The posteriors of a driver's windows multiply (``tint_sumo.traits.streaming``).
     """
 
     method = "cross_window"
@@ -42,17 +41,6 @@ class CrossWindow(TraitModel):
         self.from_follower = nn.Linear(settings.hidden_size, settings.decoder_output_size)
         self.from_latent = nn.Linear(latent_size, settings.decoder_output_size, bias=False)
         self.prediction = nn.Linear(settings.decoder_output_size, 2)
-
-    def encode(self, states: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log-variance, each (N, latent_size), of tracks of any length (N, T, 2)."""
-        if states.shape[1] <= WINDOW_STEPS:
-            return super().encode(states, length)
-        pieces = -(-states.shape[1] // WINDOW_STEPS)
-        padded = functional.pad(states, (0, 0, 0, pieces * WINDOW_STEPS - states.shape[1]))
-        lengths = (length.unsqueeze(1) - WINDOW_STEPS * torch.arange(pieces)).clamp(0, WINDOW_STEPS)
-        mean, log_var = super().encode(padded.reshape(-1, WINDOW_STEPS, 2), lengths.flatten().clamp(min=1))
-        shape = (len(states), pieces, self.latent_size)
-        return fuse(mean.view(shape), log_var.view(shape), lengths >= MIN_WINDOW_STEPS)
 
     def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:
         """Terms ``kl`` and ``prediction``, the negative log-likelihood of the other window, in nats per window."""
@@ -89,19 +77,3 @@ class CrossWindow(TraitModel):
         displacement, log_std = self.prediction(joined.relu()).float().unbind(dim=-1)
         valid = valid_steps(features, batch.other.length)[:, 1:].T
         return displacement, log_std.clamp(*LOG_STD_RANGE), features[:, 1:, 0].T, valid
-
-
-def fuse(mean: Tensor, log_var: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """What several windows of one driver say together: mean and log-variance (N, latent_size).
-
-    Windows are independent given the trait, so the posterior is the product of theirs, with the prior N(0, 1) counted
-    once. A window cannot say less than the prior does.
-
-    Args:
-        mean, log_var: (N, P, latent_size) of P windows.
-        valid: (N, P), which of them count; with none, the prior is returned.
-    """
-    precision = torch.where(valid.unsqueeze(-1), torch.exp(-log_var).clamp(min=1.0), 0.0)
-    total = 1.0 + (precision - 1.0).clamp(min=0.0).sum(dim=1)
-    weighted = (precision * mean).sum(dim=1)
-    return weighted / total, -torch.log(total)

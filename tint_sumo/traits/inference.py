@@ -4,18 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import torch
 from numpy.typing import NDArray
 
 from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, STEP_S, VehicleShape
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import require_output_file, whole_file
 from tint_sumo.dataset.tracks import read_tracks
-from tint_sumo.dataset.windows import cut_windows, steps_in_window
-from tint_sumo.traits.cross_window import CrossWindow, fuse
+from tint_sumo.dataset.windows import cut_windows, window_rows
+from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.evaluation import Latents, encode_windows
 from tint_sumo.traits.input_range import InputRange
 from tint_sumo.traits.storage import load, read_card
+from tint_sumo.traits.streaming import fuse_so_far
 
 SUFFIXES = (".csv", ".parquet")
 OUTSIDE = "outside"  # the column
@@ -53,7 +53,7 @@ def infer_traits(
     windows = cut_windows(track, np.zeros_like(track), rows["position_m"].to_numpy(), gap_m)
     if len(windows) == 0:
         raise InputError(f"{source} has no vehicle for {MIN_WINDOW_STEPS} steps of {STEP_S} s; write a longer run")
-    first = np.flatnonzero(steps_in_window(track) == MIN_WINDOW_STEPS - 1) - (MIN_WINDOW_STEPS - 1)
+    first, _ = window_rows(track)
     vehicle, start_s = rows["vehicle"].iloc[first].array, rows["time_s"].to_numpy()[first]
     number = np.asarray(pd.Series(vehicle.codes).groupby(vehicle.codes).cumcount(), np.int64)
     latents = encode_windows(trained, windows)
@@ -66,7 +66,7 @@ def infer_traits(
             "steps": windows.length,
             "has_leader": windows.has_leader,
             **_columns("", latents),
-            **(_columns("fused_", _fuse_so_far(latents, number)) if isinstance(trained, CrossWindow) else {}),
+            **(_columns("fused_", fuse_so_far(latents, vehicle.codes)) if isinstance(trained, CrossWindow) else {}),
             **({} if reach is None else {OUTSIDE: reach.outside(windows)}),
         }
     )
@@ -92,13 +92,3 @@ def _columns(prefix: str, latents: Latents) -> dict[str, NDArray[np.float32]]:
         for name, values in (("latent", latents.mean), ("std", latents.std))
         for index in range(values.shape[1])
     }
-
-
-def _fuse_so_far(latents: Latents, number: NDArray[np.int64]) -> Latents:
-    """Of each window and those before it of its vehicle; ``number`` (N,) counts them, in rows by vehicle."""
-    mean, log_var = torch.from_numpy(latents.mean).clone(), 2.0 * torch.from_numpy(latents.std).log()
-    for now in np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1]):
-        pair = np.stack((now - 1, now), axis=1)
-        counts = torch.from_numpy(pair >= (now - number[now])[:, None])  # first windows have none before them
-        mean[now], log_var[now] = fuse(mean[pair], log_var[pair], counts)
-    return Latents(mean.numpy(), torch.exp(0.5 * log_var).numpy())

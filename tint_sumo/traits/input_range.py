@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tint_sumo.config import WINDOW_STEPS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.structures import FieldError, build
-from tint_sumo.dataset.windows import Windows
+from tint_sumo.dataset.windows import Windows, valid_steps
 
 MARGIN_M = 0.1  # positions with two decimals, as SUMO writes them, are no other input
 
@@ -36,9 +36,9 @@ class InputRange:
         """Return the range of windows that come in parts."""
         low, high = np.full((WINDOW_STEPS, 2), np.inf), np.full((WINDOW_STEPS, 2), -np.inf)
         for part in parts:
-            there = _there(part)[:, :, None]
-            low = np.minimum(low, np.where(there, part.states, np.inf).min(axis=0))
-            high = np.maximum(high, np.where(there, part.states, -np.inf).max(axis=0))
+            valid = valid_steps(part.length)[:, :, None]
+            low = np.minimum(low, np.where(valid, part.states, np.inf).min(axis=0))
+            high = np.maximum(high, np.where(valid, part.states, -np.inf).max(axis=0))
         missing = low > high  # no window is so long: every value there is outside
         low, high = np.where(missing, 0.0, low), np.where(missing, -1.0, high)
         rounded = (np.round(one, 3).tolist() for one in (low[:, 0], high[:, 0], low[:, 1], high[:, 1]))
@@ -69,9 +69,4 @@ class InputRange:
         low = np.stack((self.low_offset_m, self.low_gap_m), axis=-1) - MARGIN_M
         high = np.stack((self.high_offset_m, self.high_gap_m), axis=-1) + MARGIN_M
         beyond = ((windows.states < low) | (windows.states > high)).any(axis=2)
-        return np.asarray((beyond & _there(windows)).any(axis=1))
-
-
-def _there(windows: Windows) -> NDArray[np.bool_]:
-    """Return which steps windows have, (N, 20)."""
-    return np.asarray(np.arange(WINDOW_STEPS) < windows.length[:, None])
+        return np.asarray((beyond & valid_steps(windows.length)).any(axis=1))

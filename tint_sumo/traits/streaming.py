@@ -1,22 +1,50 @@
-"""Traits of many tracks at once, brought up to date with every step instead of read from whole windows."""
+"""Posteriors of drivers from all their windows so far, from a table of windows or with every step of a track.
+
+Windows are independent given the trait, so that the posterior of several is the product of theirs, with the prior
+N(0, 1) counted once. In terms of evidence, which is the precision beyond the prior's and the precision times the mean,
+products are sums.
+"""
 
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from tint_sumo.config import MIN_WINDOW_STEPS, WINDOW_STEPS
+from tint_sumo.dataset.windows import capped
 from tint_sumo.traits.cross_window import CrossWindow
+from tint_sumo.traits.evaluation import Latents
+
+
+def evidence(mean: Tensor, log_var: Tensor) -> Tensor:
+    """Return the evidence (2, ..., latent_size) in posteriors of windows; a window cannot say less than the prior."""
+    precision = torch.exp(-log_var).clamp(min=1.0)
+    return torch.stack((precision - 1.0, precision * mean))
+
+
+def posterior(total: Tensor) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return mean and standard deviation, each (..., latent_size), from a sum of evidence; of none, the prior's."""
+    beyond_prior, weighted = total
+    precision = 1.0 + beyond_prior
+    return (weighted / precision).numpy(), precision.rsqrt().numpy()
+
+
+def fuse_so_far(latents: Latents, vehicle: NDArray[np.integer]) -> Latents:
+    """Return the posteriors of each window and those before it of its vehicle, (N,), windows sorted by time."""
+    found = evidence(torch.from_numpy(latents.mean), 2.0 * torch.from_numpy(latents.std).log())
+    rows = pd.DataFrame(found.swapaxes(0, 1).flatten(1).numpy())
+    total = torch.from_numpy(rows.groupby(vehicle).cumsum().to_numpy(copy=True))
+    return Latents(*posterior(total.view(len(total), 2, -1).swapaxes(0, 1)))
 
 
 class TrackStream:
-    """What a cross-window model says of M tracks so far.
+    """Posteriors of a cross-window model for M tracks so far.
 
     A track's windows of 20 steps follow one another from its first step on; the posteriors of those that are complete
-    and of the present one, as far as it goes, are multiplied. After every step the result is that of
-    ``CrossWindow.encode`` for the whole track up to then.
+    and of the present one, as far as it goes, are multiplied.
 
     Args:
         model: cross-window model.
@@ -30,7 +58,7 @@ class TrackStream:
         self._hidden = torch.zeros(tracks, model.settings.hidden_size)
         self._window_steps = torch.zeros(tracks, dtype=torch.int64)  # steps so far in the present window
         self._along_m = torch.zeros(tracks)
-        self._complete = torch.zeros(2, tracks, model.latent_size)  # evidence of complete windows, see _evidence
+        self._complete = torch.zeros(2, tracks, model.latent_size)  # evidence in complete windows
         self.steps = np.zeros(tracks, np.float32)
 
     def forget(self, tracks: NDArray[np.int64]) -> None:
@@ -52,14 +80,14 @@ class TrackStream:
 
     @torch.no_grad()
     def advance(
-        self, tracks: NDArray[np.int64], along_m: NDArray[np.float32], gap_m: NDArray[np.float32]
+        self, tracks: NDArray[np.int64], along_m: NDArray[np.float32], gap_m: NDArray[np.floating]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Take one step of K tracks, each at most once.
 
         Args:
             tracks: (K,) their indices.
             along_m: (K,) position along the lane.
-            gap_m: (K,) to the leader.
+            gap_m: (K,) to the leader, NaN without one.
 
         Returns:
             Mean and standard deviation of their latents, each (K, latent_size).
@@ -67,7 +95,7 @@ class TrackStream:
         index, along = torch.from_numpy(tracks), torch.from_numpy(along_m)
         begins = self._window_steps[index] == 0
         displacement = torch.where(begins, 0.0, along - self._along_m[index])
-        raw = torch.stack([displacement, torch.from_numpy(gap_m)], dim=-1)
+        raw = torch.stack([displacement, torch.from_numpy(capped(gap_m).astype(np.float32))], dim=-1)
         features = (raw - self._model.feature_mean) / self._model.feature_scale
         features[:, 0].masked_fill_(begins, 0.0)
         hidden = self._model.encoder.step(features, self._hidden[index].masked_fill_(begins.unsqueeze(-1), 0.0))
@@ -77,18 +105,7 @@ class TrackStream:
         self._window_steps[index] = window_steps.masked_fill(complete, 0)
         self.steps[tracks] += 1.0
 
-        window = self._evidence(hidden).masked_fill_(~counts.view(-1, 1, 1), 0.0)
-        so_far = self._complete[:, index] + window.transpose(0, 1)
+        window = evidence(*self._model.encoder.heads(hidden)).masked_fill_(~counts.unsqueeze(-1), 0.0)
+        so_far = self._complete[:, index] + window
         self._complete[:, index] = torch.where(complete.unsqueeze(-1), so_far, self._complete[:, index])
-        precision, weighted = so_far
-        total = 1.0 + precision
-        return (weighted / total).numpy(), total.rsqrt().numpy()
-
-    def _evidence(self, hidden: Tensor) -> Tensor:
-        """Of windows with these states (K, hidden): precision beyond the prior's, and precision times mean.
-
-        Both add up over windows; see ``tint_sumo.traits.cross_window.fuse``. (K, 2, latent_size).
-        """
-        mean, log_var = self._model.encoder.heads(hidden)
-        precision = torch.exp(-log_var).clamp(min=1.0)
-        return torch.stack([precision - 1.0, precision * mean], dim=1)
+        return posterior(so_far)

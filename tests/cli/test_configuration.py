@@ -1,6 +1,5 @@
 """Configuration files: what commands read from them, and what they print."""
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from tests.cli.calls import refuse, run
 from tests.scenes.networks import UserNetwork
 from tint_sumo.cli.command_line import TintSumo, main, parse
 from tint_sumo.cli.configuration import commands_named, subcommands
@@ -63,21 +63,6 @@ def written(folder: Path, text: str, name: str = "config.yaml") -> Path:
     file = folder / name
     file.write_text(text, encoding="utf-8")
     return file
-
-
-def refused(capsys: pytest.CaptureFixture[str], *words: Any) -> str:
-    assert main([*map(str, words)]) == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert len(told.err.splitlines()) == 1
-    return told.err.removeprefix("tint-sumo: error: ").rstrip()
-
-
-def ran(capsys: pytest.CaptureFixture[str], *words: Any) -> dict[str, Any]:
-    assert main([*map(str, words), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert isinstance(found, dict)
-    return found
 
 
 # From flags to a file and back
@@ -243,7 +228,7 @@ def test_bad_files_are_refused_in_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     file = written(tmp_path, text)
-    told = refused(capsys, *command.split(), "--config", file)
+    told = refuse(capsys, *command.split(), "--config", file)
     assert message in told
     assert str(file) in told or "out: x" in text or "folder of its own" in told
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
@@ -251,9 +236,9 @@ def test_bad_files_are_refused_in_one_line(
 
 def test_missing_and_unreadable_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     message = f"configuration: no file {tmp_path / 'no.yaml'}; check the path"
-    assert refused(capsys, "bench", "--config", tmp_path / "no.yaml") == message
+    assert refuse(capsys, "bench", "--config", tmp_path / "no.yaml") == message
     (tmp_path / "binary.yaml").write_bytes(b"\xff\x00")
-    assert "is not a text file" in refused(capsys, "bench", "--config", tmp_path / "binary.yaml")
+    assert "is not a text file" in refuse(capsys, "bench", "--config", tmp_path / "binary.yaml")
 
 
 # What can be defined there
@@ -269,26 +254,26 @@ SMALL = "budget: {n_envs: 2, n_steps: 8, n_minibatches: 1}\nsteps: 1\nout: run\n
 
 def test_drivers_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "data"
-    manifest = ran(capsys, "record", "--config", written(tmp_path, DRIVERS), "--windows", 20, "--out", out)
+    manifest = run(capsys, "record", "--config", written(tmp_path, DRIVERS), "--windows", 20, "--out", out)
     assert [profile["name"] for profile in manifest["population"]["profiles"]] == ["shy", "calm", "bold"]
     windows = load_windows(out)
     names = load_drivers(out, windows, ["trait"])["trait"]
     assert set(names) == {"shy", "calm", "bold"}
     assert [("shy", "calm", "bold")[label] for label in load_labels(out, windows)] == list(names)
-    found = ran(capsys, "dataset", "inspect", out)["traits"]
+    found = run(capsys, "dataset", "inspect", out)["traits"]
     assert found["shy"]["speed_mps"]["max"] <= 2.0 < found["bold"]["speed_mps"]["max"]
-    assert "holds another run (different: population)" in refused(capsys, "record", "--windows", 20, "--out", out)
+    assert "holds another run (different: population)" in refuse(capsys, "record", "--windows", 20, "--out", out)
 
 
 def test_a_trait_model_of_another_scene_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = written(tmp_path, "scene: {claim: {braking_mps2: 4}, name: hasty}")
     out = tmp_path / "data"
-    assert ran(capsys, "record", "--config", scene, "--windows", 20, "--out", out)["scene"] == "hasty"
+    assert run(capsys, "record", "--config", scene, "--windows", 20, "--out", out)["scene"] == "hasty"
     message = "trait model vae was trained in scene t_intersection"
-    assert message in refused(capsys, "traits", "evaluate", "--data", out, "--model", "vae")
+    assert message in refuse(capsys, "traits", "evaluate", "--data", out, "--model", "vae")
     train = written(tmp_path, f"method: vae\n{SMALL}{scene.read_text()}", "train.yaml")
     argv = ("policy", "train", "--config", train, "--out", tmp_path / "run")
-    assert "the policy is of scene hasty" in refused(capsys, *argv)
+    assert "the policy is of scene hasty" in refuse(capsys, *argv)
     assert not (tmp_path / "run").exists()
 
 
@@ -298,16 +283,16 @@ def test_a_policy_drives_in_the_scene_that_it_was_trained_in(
     monkeypatch.chdir(tmp_path)
     scene = "scene: {base: four_way, name: small, max_vehicles: 4, time_limit_s: 2, population: {idm: {tau_s: 2}}}"
     file = written(tmp_path, f"method: oracle\n{SMALL}{scene}")
-    ran(capsys, "policy", "train", "--config", file)
-    found = ran(capsys, "policy", "evaluate", "--model", "run", "--episodes", 2)
+    run(capsys, "policy", "train", "--config", file)
+    found = run(capsys, "policy", "evaluate", "--model", "run", "--episodes", 2)
     assert (found["scene"], found["tau_s"]) == ("small", 2.0)
     message = "policy run needs max_vehicles of 4, and scene four_way has 12"
-    assert message in refused(capsys, "policy", "evaluate", "--model", "run", "--scene", "four_way")
+    assert message in refuse(capsys, "policy", "evaluate", "--model", "run", "--scene", "four_way")
     written(tmp_path, scene)
-    found = ran(capsys, "policy", "evaluate", "--model", "always_go", "--config", file, "--episodes", 2)
+    found = run(capsys, "policy", "evaluate", "--model", "always_go", "--config", file, "--episodes", 2)
     assert (found["scene"], found["timeout"]) == ("small", 1.0)
-    assert ran(capsys, "render", "--model", "run", "--out", "film.png")["time_s"] == 2.0
-    assert ran(capsys, "render", "--model", "ttc", "--config", file, "--out", "other.png")["scene"] == "small"
+    assert run(capsys, "render", "--model", "run", "--out", "film.png")["time_s"] == 2.0
+    assert run(capsys, "render", "--model", "ttc", "--config", file, "--out", "other.png")["scene"] == "small"
 
 
 def test_policies_and_films_of_other_drivers(
@@ -317,11 +302,11 @@ def test_policies_and_films_of_other_drivers(
     scene = "scene:\n  name: three\n  time_limit_s: 1\n" + DRIVERS.replace("\n", "\n  ")
     file = written(tmp_path, SMALL + scene)
     message = "method oracle is told which of two kinds of drivers each one is of, and scene three has 3"
-    assert message in refused(capsys, "policy", "train", "--method", "oracle", "--config", file)
-    ran(capsys, "policy", "train", "--method", "no_labels", "--config", file)
-    assert "a film shows drivers of two profiles" in refused(capsys, "render", "--model", "run", "--out", "film.png")
+    assert message in refuse(capsys, "policy", "train", "--method", "oracle", "--config", file)
+    run(capsys, "policy", "train", "--method", "no_labels", "--config", file)
+    assert "a film shows drivers of two profiles" in refuse(capsys, "render", "--model", "run", "--out", "film.png")
     study = ("study", "run", "--config", written(tmp_path, scene), "--out", "study")
-    assert "a study is of two profiles of drivers, and scene three has 3" in refused(capsys, *study)
+    assert "a study is of two profiles of drivers, and scene three has 3" in refuse(capsys, *study)
     assert not Path("study").exists()
 
 
@@ -338,23 +323,23 @@ def test_a_sumo_configuration_as_a_scene(
         "  warm_up_s: 1\n  time_limit_s: 1\n"
     )
     file = written(tmp_path, scene)
-    manifest = ran(capsys, "record", "--config", file, "--windows", 20, "--out", "data")
+    manifest = run(capsys, "record", "--config", file, "--windows", 20, "--out", "data")
     assert manifest["population"] == ["calm", "hasty"]
     argv = ("record", "--config", file, "--population", "traits", "--out", "other")
-    assert "--population does not go with the sumocfg of a scene" in refused(capsys, *argv)
+    assert "--population does not go with the sumocfg of a scene" in refuse(capsys, *argv)
     one = SMALL.replace("n_envs: 2", "n_envs: 1")  # each has a process of its own
     train = written(tmp_path, one + scene, "train.yaml")
-    ran(capsys, "policy", "train", "--method", "oracle", "--config", train)
-    found = ran(capsys, "policy", "evaluate", "--model", "run", "--episodes", 1)
+    run(capsys, "policy", "train", "--method", "oracle", "--config", train)
+    found = run(capsys, "policy", "evaluate", "--model", "run", "--episodes", 1)
     assert (found["scene"], found["p_conservative"], found["timeout"]) == ("merge", None, 1.0)
     argv = ("policy", "train", "--method", "oracle", "--config", train, "--out", "new", "--p-conservative", 0.2)
-    assert "leave p_conservative out" in refused(capsys, *argv)
+    assert "leave p_conservative out" in refuse(capsys, *argv)
     evaluation = ("policy", "evaluate", "--episodes", 1, "--model")
-    assert "leave p_conservative and tau_s out" in refused(capsys, *evaluation, "run", "--tau", 2)
-    assert "ttc needs the conflict zones" in refused(capsys, *evaluation, "ttc", "--config", file)
-    assert "films show built-in scenes only" in refused(capsys, "render", "--model", "run", "--out", "film.gif")
-    assert "a study needs a built-in scene" in refused(capsys, "study", "run", "--out", "study", "--config", file)
-    assert "scene merge has SUMO's files already" in refused(capsys, "net", "--config", file)
+    assert "leave p_conservative and tau_s out" in refuse(capsys, *evaluation, "run", "--tau", 2)
+    assert "ttc needs the conflict zones" in refuse(capsys, *evaluation, "ttc", "--config", file)
+    assert "films show built-in scenes only" in refuse(capsys, "render", "--model", "run", "--out", "film.gif")
+    assert "a study needs a built-in scene" in refuse(capsys, "study", "run", "--out", "study", "--config", file)
+    assert "scene merge has SUMO's files already" in refuse(capsys, "net", "--config", file)
 
 
 def test_all_of_a_study_is_in_its_scene(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ import pytest
 
 from tint_sumo.cli import main
 from tint_sumo.core import files
-from tint_sumo.dataset.recorder import record
 from tint_sumo.scenes import network
 from tint_sumo.scenes.network import build_network
 
@@ -88,19 +87,12 @@ def test_a_closed_pipe_of_stderr_ends_the_work(closed_pipe: int, tmp_path: Path)
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("argv", ["--help", "record --out x --print-config", "dataset inspect DATA"])
-def test_output_that_cannot_be_written_is_told(argv: str, unbuffered: str, dataset: Path) -> None:
+def test_output_that_cannot_be_written_is_an_error(argv: str, unbuffered: str, dataset: Path) -> None:
     words = [str(dataset) if word == "DATA" else word for word in argv.split()]
     with Path("/dev/full").open("w") as full:
         ended = start(*words, stdout=full, env=os.environ | {"PYTHONUNBUFFERED": unbuffered})
     assert ended.returncode == 1
     require_one_line(ended.stderr, "No space left on device; free some space, or choose another folder")
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data") / "dataset"
-    record(folder, 100, workers=2, progress=False)
-    return folder
 
 
 # A command of each kind that writes, and what it leaves
@@ -143,7 +135,7 @@ def test_a_folder_that_nobody_may_write_to_is_found_before_the_work_begins(
 
 
 @pytest.mark.parametrize("argv", ["net --out OUT/net", "record --windows 100 --out OUT/data"])
-def test_a_limit_of_file_sizes_is_told(argv: str, tmp_path: Path, dataset: Path) -> None:
+def test_a_limit_of_file_sizes_is_an_error(argv: str, tmp_path: Path, dataset: Path) -> None:
     ended = start(*words_of(argv, tmp_path, dataset), preexec_fn=limit(resource.RLIMIT_FSIZE, 4096))
     assert ended.returncode == 1
     require_one_line(ended.stderr, "File too large; raise the limit of file sizes (ulimit -f)")
@@ -186,7 +178,7 @@ def test_a_disk_that_gets_full_leaves_whole_files_alone(
 
 
 @pytest.mark.parametrize("left_bytes", [0, 4_096, 16_384, 24_576, 32_768])  # netconvert reports success on all of them
-def test_a_full_temporary_folder_is_told_before_half_a_network_is_used(
+def test_a_full_temporary_folder_is_found_before_half_a_network_is_used(
     left_bytes: int, disk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     build_network.cache_clear()
@@ -200,7 +192,7 @@ def test_a_full_temporary_folder_is_told_before_half_a_network_is_used(
     assert main(argv) == 0  # nothing of the failure is remembered
 
 
-def test_a_netconvert_that_fails_is_told_in_one_line(
+def test_a_netconvert_that_fails_is_reported_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     build_network.cache_clear()
@@ -214,7 +206,7 @@ def test_a_netconvert_that_fails_is_told_in_one_line(
 
 @pytest.mark.parametrize("files_open", [8, 10, 12])
 @pytest.mark.parametrize("argv", ["net --out OUT/net", "record --windows 20 --workers 2 --out OUT/data"])
-def test_too_many_open_files_are_told(argv: str, files_open: int, tmp_path: Path, dataset: Path) -> None:
+def test_too_many_open_files_are_an_error(argv: str, files_open: int, tmp_path: Path, dataset: Path) -> None:
     ended = start(*words_of(argv, tmp_path, dataset), preexec_fn=limit(resource.RLIMIT_NOFILE, files_open))
     if ended.returncode != 0:
         assert ended.returncode == 1
@@ -227,7 +219,8 @@ def test_a_name_that_is_no_text_is_refused(
     argv: str, tmp_path: Path, dataset: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(words_of(argv, tmp_path / "\udcff", dataset)) == 2
-    assert "is no text in UTF-8; choose another --out" in capsys.readouterr().err
+    flag = "--figure" if "--figure" in argv else "--out"
+    assert f"is no text in UTF-8; choose another {flag}" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -121,7 +121,7 @@ def require_output_file(file: Path, suffixes: Sequence[str], argument: str = "ou
     if file.is_dir() or not _nearest_entry(file.parent).is_dir():
         raise InputError(f"{file} cannot be a file there; choose another `{argument}`")
     _require_no_run(file, argument)
-    _require_writable(file.parent)
+    _require_writable(file.parent, argument)
 
 
 def require_output_folder(folder: Path, argument: str = "out") -> None:
@@ -134,7 +134,7 @@ def require_output_folder(folder: Path, argument: str = "out") -> None:
     if not _nearest_entry(folder).is_dir():
         raise InputError(f"{folder} is a file, not a folder, or lies below one; choose another `{argument}`")
     _require_no_run(folder, argument)
-    _require_writable(folder)
+    _require_writable(folder, argument)
 
 
 def _require_no_run(path: Path, argument: str) -> None:
@@ -145,7 +145,7 @@ def _require_no_run(path: Path, argument: str) -> None:
             raise InputError(f"{path} lies in {folder}, which belongs to a run; choose another `{argument}`")
 
 
-def _require_writable(folder: Path) -> None:
+def _require_writable(folder: Path, argument: str) -> None:
     """Check that files of some size can be written into ``folder``, which need not be there yet.
 
     Raises:
@@ -155,7 +155,8 @@ def _require_writable(folder: Path) -> None:
     try:
         str(folder.resolve()).encode()
     except UnicodeEncodeError:
-        raise InputError(f"the name {str(folder.resolve())!a} is no text in UTF-8; choose another `out`") from None
+        name = ascii(str(folder.resolve()))
+        raise InputError(f"the name {name} is no text in UTF-8; choose another `{argument}`") from None
     try:
         with TemporaryFile(dir=_nearest_entry(folder)) as file:
             os.posix_fallocate(file.fileno(), 0, MIN_ROOM_BYTES)
@@ -187,7 +188,7 @@ def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bo
     """
     wanted = json.loads(json.dumps(settings))
     _require_home(folder, wanted)
-    _require_writable(folder)
+    _require_writable(folder, "out")
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK_FILE, timeout=LOCK_TIMEOUT_S)
     try:

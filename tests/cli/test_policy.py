@@ -1,0 +1,96 @@
+"""``tint-sumo policy``."""
+
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.cli.calls import Started, copy, files, refuse, run
+from tint_sumo.cli import main
+from tint_sumo.core.checkpoints import CHECKPOINT_FILE
+from tint_sumo.core.files import shipped
+from tint_sumo.methods.registry import METHODS, Learned
+
+
+def test_help_names_the_learned_methods(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["policy", "train", "--help"])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert all(name in printed for name, method in METHODS.items() if isinstance(method, Learned))
+
+
+def test_policy_train(
+    tmp_path: Path, trait_model: Path, small_training: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    train = ("policy", "train", "--method", "vae", "--config", small_training)
+    argv = (*train, "--steps", 1, "--traits", trait_model, "--out", out)
+    printed = run(capsys, *argv, "--p-conservative", 0.25)
+    assert printed == {
+        "model": str(out / "policy.safetensors"), "method": "vae", "p_conservative": [0.25], "steps": 1, "seed": 0
+    }  # fmt: skip
+    before = files(out)
+    assert "another run" in refuse(capsys, *argv, "--p-conservative", 0.3)
+    assert files(out) == before
+    found = run(capsys, "policy", "evaluate", "--model", out, "--episodes", 2)
+    assert found["p_conservative"] == [0.25, 0.25]
+
+
+def test_a_pickled_policy_is_read_on_request_alone(
+    tmp_path: Path, small_training: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    train = ("policy", "train", "--method", "oracle", "--config", small_training)
+    run(capsys, *train, "--steps", 1, "--zip", "--out", out)
+    argv = ("policy", "evaluate", "--model", out / "policy.zip", "--episodes", 2)
+    assert "--allow-pickle if you trust the file" in refuse(capsys, *argv)
+    assert main([*map(str, argv), "--allow-pickle"]) == 0
+    printed = capsys.readouterr()
+    assert "a pickle: it can run any code" in printed.err
+    of_zip = printed.out
+    assert main(["policy", "evaluate", "--model", str(out), "--episodes", "2"]) == 0
+    assert capsys.readouterr().out == of_zip
+
+
+def test_policy_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
+    printed = run(capsys, "policy", "evaluate", "--model", "always_go", "--episodes", 6, "--p-conservative", 0.9)
+    assert printed["success"] + printed["collision"] + printed["timeout"] == pytest.approx(1.0)
+    assert (printed["model"], printed["episodes"], printed["seed"]) == ("always_go", 6, 0)
+    assert printed["p_conservative"] == 0.9
+    assert "navigation_time_s" in printed
+    low, high = printed["intervals"]["success"]
+    assert low <= printed["success"] <= high
+
+
+def test_policies_are_evaluated_in_other_traffic(capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ("policy", "evaluate", "--model", "ttc", "--episodes", 12, "--p-conservative", 0.2, 0.8)
+    plain, other = run(capsys, *argv), run(capsys, *argv, "--noise", 0.2, "--tau", 0.5)
+    assert plain["p_conservative"] == other["p_conservative"] == [0.2, 0.8]
+    assert (other["position_noise_m"], other["tau_s"]) == (0.2, 0.5)
+    assert plain["navigation_time_s"] != other["navigation_time_s"]
+
+
+def test_damaged_models(dataset: Path, trait_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    broken = copy(trait_model.parent, tmp_path / "broken")
+    (broken / "model.safetensors").write_bytes(b"nonsense")
+    assert "damaged" in refuse(capsys, "traits", "evaluate", "--data", dataset, "--model", broken)
+    policy = tmp_path / "policy.safetensors"
+    policy.write_bytes(b"nonsense")
+    policy.with_suffix(".json").write_bytes((shipped("models") / "policies" / "oracle.json").read_bytes())
+    assert "damaged" in refuse(capsys, "policy", "evaluate", "--model", policy)
+
+
+def test_an_interrupted_training_goes_on(
+    tmp_path: Path, small_training: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train = ("policy", "train", "--method", "oracle", "--config", small_training)
+    argv = (*train, "--steps", 6_400, "--out", tmp_path / "run")
+    printed = Started(*argv).interrupt_at(r"[1-9]\d*% ", signal.SIGTERM)
+    assert "Traceback" not in printed
+    assert "tint-sumo: interrupted" in printed
+    names = {path.name for path in (tmp_path / "run").glob("[!.]*")}
+    assert names >= {"run.json", CHECKPOINT_FILE, "curve.csv", "tensorboard"}
+    assert "policy.safetensors" not in names
+    run(capsys, *argv)
+    assert (tmp_path / "run" / "policy.safetensors").exists()
+    assert not (tmp_path / "run" / CHECKPOINT_FILE).exists()

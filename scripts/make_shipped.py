@@ -29,9 +29,8 @@ from tint_sumo.methods.registry import Learned, find_method
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.scenes import T_INTERSECTION
-from tint_sumo.scenes.geometry import pose_distance_m
-from tint_sumo.simulation.simulation import Simulation
-from tint_sumo.simulation.sumocfg import SumocfgSimulation
+from tint_sumo.scenes.geometry import clearance_m
+from tint_sumo.simulation import SceneSimulation, Simulation
 from tint_sumo.study.budgets import BUDGETS
 from tint_sumo.study.figures import plot_bars, plot_worlds
 from tint_sumo.study.jobs import label
@@ -167,15 +166,12 @@ def picture_of(scene: str) -> NDArray[np.uint8]:
     return shown[len(shown) // 2]
 
 
-def is_clear_in_traffic(simulation: Simulation | SumocfgSimulation) -> bool:
-    """Whether the ego claims a lane and all vehicles are as far from it as its safety check asks, or farther."""
-    assert isinstance(simulation, Simulation)
-    slots, shape = simulation.slots, simulation.scene.vehicle
-    ego, size = simulation.egos.pose[0], (shape.length_m, shape.width_m)
-    poses = slots.pose[0, slots.present[0]]
-    return bool(simulation.egos.has_claimed[0].any()) and all(
-        pose_distance_m(ego, one, *size, *size) >= CLEAR_M for one in poses
-    )
+def is_clear_in_traffic(simulation: Simulation) -> bool:
+    """Return whether the ego claims a lane and all vehicles are as far from it as its safety check asks, or farther."""
+    assert isinstance(simulation, SceneSimulation)
+    slots, ego = simulation.slots, simulation.egos.box[0]
+    clear = all(clearance_m(ego, box) >= CLEAR_M for box in slots.box[0, slots.present[0]])
+    return clear and bool(simulation.yielding.has_claimed[0].any())
 
 
 def make_films() -> None:

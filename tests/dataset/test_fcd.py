@@ -18,7 +18,7 @@ from tint_sumo.dataset.fcd import EPISODE_PERIOD_S, VEHICLE_TYPE, write_fcd
 from tint_sumo.dataset.recorder import record, simulate_episodes
 from tint_sumo.dataset.schema import FCD, TRAJECTORIES
 from tint_sumo.scenes.layout import layout
-from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation import SceneSimulation
 
 EPISODES = (5, 6)
 NUMBERS = ["x", "y", "angle", "speed", "pos", "slope", "acceleration"]
@@ -109,7 +109,7 @@ def test_sumo_writes_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     start, theirs_file = libsumo.start, tmp_path / "sumo.xml"
     options = ["--fcd-output", str(theirs_file), "--fcd-output.acceleration", "true"]
     monkeypatch.setattr(libsumo, "start", lambda command: start([*command, *options]))
-    simulation = Simulation(1, T, with_ego=False, backend="libsumo")
+    simulation = SceneSimulation(1, T, with_ego=False, backend="libsumo")
     rows, _ = simulate_episodes(simulation, seed=3, first_episode=0, steps=200)
     simulation.close()
     kept = rows.astype(dict.fromkeys(["time_s", "position_m", "speed_mps", "acceleration_mps2"], np.float32))

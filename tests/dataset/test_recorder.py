@@ -13,7 +13,7 @@ from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.recorder import EPISODE_STEPS, EPISODES_PER_SHARD, record, simulate_episodes
 from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES
-from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation import SceneSimulation
 
 WINDOWS = 3000  # one shard
 TWO_SHARDS = 5000
@@ -40,7 +40,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_rows_are_what_sumo_reports() -> None:
-    simulation = Simulation(2, T, with_ego=False)
+    simulation = SceneSimulation(2, T, with_ego=False)
     try:
         for replica in range(2):
             simulation.reset(replica, [0, replica])
@@ -173,7 +173,7 @@ def test_bad_arguments_write_nothing(tmp_path: Path, arguments: dict[str, Any], 
 
 def test_libsumo_is_free_again_after_recording(tmp_path: Path) -> None:
     record(tmp_path / "d", 10, progress=False)
-    simulation = Simulation(1, T, backend="libsumo")
+    simulation = SceneSimulation(1, T, backend="libsumo")
     simulation.close()
 
 

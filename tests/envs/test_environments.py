@@ -137,14 +137,14 @@ def test_the_observation_is_what_the_table_says(env: SceneEnv) -> None:
     for _ in range(30):
         observation, *_, info = env.step(np.int64(GO))
     speed = simulation.egos.speed_mps[0] / 3.0
-    pose = simulation.egos.pose[0]
-    heading = np.array([pose["heading_x"], pose["heading_y"]])
-    assert observation["ego"][:2] * 20.0 == pytest.approx([pose["x_m"], pose["y_m"]], abs=1e-5)
+    box = simulation.egos.box[0]
+    heading = np.array([box["heading_x"], box["heading_y"]])
+    assert observation["ego"][:2] * 20.0 == pytest.approx([box["x_m"], box["y_m"]], abs=1e-5)
     assert observation["ego"][2:] == pytest.approx(speed * heading, abs=1e-6)
     slots = np.flatnonzero(observation["mask"])
     for slot in slots:
         seen = observation["vehicles"][slot] * 20.0 + observation["ego"][:2] * 20.0
-        assert seen == pytest.approx([simulation.slots.x_m[0, slot], simulation.slots.y_m[0, slot]], abs=1e-4)
+        assert seen == pytest.approx(simulation.slots.box[["x_m", "y_m"]][0, slot].tolist(), abs=1e-4)
         assert info["traits"][slot] == (0 if simulation.yielding.yields[0, slot] else 1)
     empty = observation["mask"] == 0.0
     assert not observation["vehicles"][empty].any()
@@ -225,7 +225,7 @@ def test_rewards_and_outcomes(preset: str) -> None:
             assert truncated is (outcome == "timeout")
             assert ("collision" in info) is (outcome == "collision")
             if outcome == "success":
-                assert env._episodes.simulation.egos.pose["x_m"][0] > 8.0
+                assert env._episodes.simulation.egos.box["x_m"][0] > 8.0
             if outcome == "timeout":
                 assert info["time_s"] == pytest.approx(15.0)
         assert outcomes == {"success", "collision", "timeout"}

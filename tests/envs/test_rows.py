@@ -28,7 +28,7 @@ from tint_sumo.envs.rows import (
     step_info,
 )
 from tint_sumo.scenes import find_scene
-from tint_sumo.scenes.geometry import POSE
+from tint_sumo.scenes.geometry import BOX
 
 RULES = TaskRules(goal_m=30.0, step_limit=100, goal=2.5, collision=-2.0, speed_weight_per_mps=0.05, step=-0.25)
 GOAL, BEYOND = 30.0, math.nextafter(30.0, math.inf)
@@ -98,16 +98,16 @@ def test_an_end_is_told_wherever_it_is() -> None:
         assert judge(still, still, np.array(ended), np.zeros(2, np.int64), RULES, rows) == any(ended)
 
 
-def poses(*values: tuple[float, float, float, float]) -> np.ndarray:
-    return np.array(list(values), POSE)
+def boxes(*values: tuple[float, float, float, float]) -> np.ndarray:
+    return np.array([(*value, 5.0, 2.0) for value in values], BOX)
 
 
 def test_observations_are_scaled_and_bounded() -> None:
     rows = np.zeros(2, row_type(3))
     rows["vehicles"] = rows["mask"] = 9.0  # of an earlier step
-    egos = poses((2.0, -4.0, 0.6, 0.8), (100.0, -100.0, 0.0, -1.0))
+    egos = boxes((2.0, -4.0, 0.6, 0.8), (100.0, -100.0, 0.0, -1.0))
     near, far, gone = (12.0, -14.0, 1.0, 0.0), (500.0, -500.0, 1.0, 0.0), (7.0, 7.0, 1.0, 0.0)
-    vehicles = np.stack([poses(near, far, gone), poses(gone, gone, near)])
+    vehicles = np.stack([boxes(near, far, gone), boxes(gone, gone, near)])
     present = np.array([[True, True, False], [False, False, True]])
     traits = np.array([[1, 0, -1], [-1, -1, 1]], np.int8)
     noise_m = np.zeros((2, 3, 2))
@@ -126,7 +126,7 @@ def test_tracks_are_seen_with_the_noise_along_the_way() -> None:
     rows = np.zeros(1, row_type(4))
     rows["position_m"] = rows["gap_m"] = 9.0
     west, north = (0.0, 0.0, -1.0, 0.0), (0.0, 0.0, 0.6, 0.8)
-    vehicles = poses(west, north, west, north)[None]
+    vehicles = boxes(west, north, west, north)[None]
     present = np.array([[True, True, True, False]])
     noise_m = np.array([[[0.5, 9.0], [1.0, 2.0], [-0.25, 0.0], [4.0, 4.0]]])
     front_m, gap_m = np.array([[10.0, 20.0, 30.0, 40.0]]), np.array([[3.0, 4.0, 0.0, 0.0]])

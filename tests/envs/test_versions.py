@@ -9,6 +9,7 @@ from tint_sumo import ENV_IDS
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.scenes import T_INTERSECTION
+from tint_sumo.simulation import SceneSimulation
 
 # Of the states under the actions below, computed when TIntersection-v1 was registered.
 T_INTERSECTION_V1 = "845b4ba7b9c15091bd26cb1fd64ee7697bb1266f0c2cf7136772ea95e2f3f6e7"
@@ -28,13 +29,15 @@ def test_episodes_of_the_t_intersection_are_those_of_its_version() -> None:
     )
     assert isinstance(env, SceneVectorEnv) and isinstance(env.batch, LocalBatch)
     simulation, found = env.batch.episodes.simulation, hashlib.sha256()
+    assert isinstance(simulation, SceneSimulation)
     try:
         env.reset(seed=3)
         for taken in actions:
             _, _, terminated, truncated, _ = env.step(taken)
             slots, egos = simulation.slots, simulation.egos
-            of_slots = (slots.route, slots.front_m, slots.member, slots.vehicle_number, simulation.yielding.reacts)
-            of_egos = (egos.front_m, egos.speed_mps, egos.has_claimed, simulation.time_s, terminated | truncated)
+            yielding, ends = simulation.yielding, terminated | truncated
+            of_slots = (slots.route, slots.front_m, slots.member, slots.vehicle_number, yielding.reacts)
+            of_egos = (egos.front_m, egos.speed_mps, yielding.has_claimed, simulation.time_s, ends)
             for values in (*(np.where(slots.present, one, -1) for one in of_slots), *of_egos):
                 found.update(values.astype(float).tobytes())
     finally:

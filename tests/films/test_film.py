@@ -72,7 +72,7 @@ def test_only_those_that_slow_down_brake() -> None:
         for slot in np.flatnonzero(now.brakes):
             assert before.present[slot] and last.present[slot] and now.present[slot]
             was, is_ = (
-                np.hypot(to.poses["x_m"] - at.poses["x_m"], to.poses["y_m"] - at.poses["y_m"])[slot]
+                np.hypot(to.boxes["x_m"] - at.boxes["x_m"], to.boxes["y_m"] - at.boxes["y_m"])[slot]
                 for at, to in ((before, last), (last, now))
             )
             assert is_ < was

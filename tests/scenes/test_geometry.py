@@ -9,14 +9,15 @@ from shapely.geometry import Polygon, box
 
 from tint_sumo.config import VehicleShape
 from tint_sumo.scenes.geometry import (
-    POSE,
+    BOX,
+    NO_VEHICLE,
     SPACING_M,
     as_line,
     box_distance_m,
     find_leaders,
     follow,
     measure_distances_m,
-    measure_unlike_distances_m,
+    new_boxes,
     place,
     project,
     resample,
@@ -40,8 +41,9 @@ def car(x_m: float, y_m: float, heading_rad: float, shape: VehicleShape = SHAPE)
     return translate(rotate(body, heading_rad, origin=(0, 0), use_radians=True), x_m, y_m)
 
 
-def pose(x_m: float, y_m: float, heading_rad: float) -> tuple[float, float, float, float]:
-    return x_m, y_m, math.cos(heading_rad), math.sin(heading_rad)
+def placed(x_m: float, y_m: float, heading_rad: float, shape: VehicleShape = SHAPE) -> tuple[float, ...]:
+    """Return a record of ``BOX``."""
+    return x_m, y_m, math.cos(heading_rad), math.sin(heading_rad), shape.length_m, shape.width_m
 
 
 @given(st.floats(-6, 6), st.floats(-6, 6), st.floats(0, math.pi))
@@ -58,12 +60,17 @@ CARS = st.tuples(st.floats(-12, 12), st.floats(-12, 12), st.floats(0, 2 * math.p
 def test_distances_are_those_of_the_polygons_however_the_boxes_stand(
     ego: tuple[float, float, float], others: list[tuple[float, float, float]], reach_m: float
 ) -> None:
-    egos, vehicles = np.array([pose(*ego)], POSE), np.array([[pose(*one) for one in [*others, others[0]]]], POSE)
+    """Vehicles are of different sizes; the last slot is empty."""
+    shapes = [SHAPE, BICYCLE, VehicleShape(12.0, 2.5)]
+    egos = np.array([placed(*ego)], BOX)
+    vehicles = np.array(
+        [[*(placed(*one, shape) for one, shape in zip(others, shapes, strict=True)), placed(*ego)]], BOX
+    )
     present = np.array([[True, True, True, False]])
     exact, found = np.empty((1, 4)), np.empty((1, 4))
-    measure_distances_m(egos, present, vehicles, np.inf, SHAPE.length_m, SHAPE.width_m, exact)
-    measure_distances_m(egos, present, vehicles, reach_m, SHAPE.length_m, SHAPE.width_m, found)
-    expected = [car(*ego).distance(car(*one)) for one in others]
+    measure_distances_m(egos, present, vehicles, np.inf, exact)
+    measure_distances_m(egos, present, vehicles, reach_m, found)
+    expected = [car(*ego).distance(car(*one, shape)) for one, shape in zip(others, shapes, strict=True)]
     assert exact[0].tolist() == pytest.approx([*expected, math.inf], abs=1e-9)
     assert ((found == exact) | ((exact > reach_m) & np.isinf(found))).all()
 
@@ -85,9 +92,9 @@ def test_the_front_moves_by_arc_length(front_m: float) -> None:
 
 @given(st.floats(0.0, 20.0))
 def test_a_box_has_front_and_back_on_its_way(front_m: float) -> None:
-    poses = np.zeros(1, POSE)
-    place(np.array([front_m]), WAY, SHAPE.length_m, poses)
-    one = poses[0]
+    boxes = new_boxes(1, SHAPE.length_m, SHAPE.width_m)
+    place(np.array([front_m]), WAY, boxes)
+    one = boxes[0]
     front, back = way_point(WAY, front_m), way_point(WAY, front_m - SHAPE.length_m)
     heading = np.subtract(front, back) / math.dist(front, back)
     assert (one["heading_x"], one["heading_y"]) == pytest.approx(tuple(heading))
@@ -108,15 +115,15 @@ def test_a_vehicle_whose_lane_position_drops_is_on_the_next_lane() -> None:
     lane_start_m = np.array([[0.0, 6.0, 12.0], [0.0, 10.0, np.inf]])
     ways = np.stack([WAY, WAY + 100.0])
     route, stage = np.array([0, 1, 1]), np.array([0, 1, 0])
-    was_pos_m, front_m, poses = np.array([5.9, 3.0, 7.0]), np.zeros(3), np.zeros(3, POSE)
+    was_pos_m, front_m, boxes = np.array([5.9, 3.0, 7.0]), np.zeros(3), new_boxes(3, 5.0, 2.0)
     moved = (np.array([0, 1]), np.array([0.2, 3.1]))
-    follow(*moved, route, lane_start_m, ways, 5.0, stage, was_pos_m, front_m, poses)
+    follow(*moved, route, lane_start_m, ways, stage, was_pos_m, front_m, boxes)
     assert stage.tolist() == [1, 1, 0]
     assert was_pos_m.tolist() == [0.2, 3.1, 7.0]
     assert front_m.tolist() == [6.2, 13.1, 0.0]
-    assert (poses["x_m"][0], poses["y_m"][0]) == pytest.approx((3.7, 0.0))
-    assert poses["x_m"][1] > 100.0
-    assert poses["x_m"][2] == 0.0
+    assert (boxes["x_m"][0], boxes["y_m"][0]) == pytest.approx((3.7, 0.0))
+    assert boxes["x_m"][1] > 100.0
+    assert boxes["x_m"][2] == 0.0
 
 
 def test_leaders_are_seen_on_shared_lanes_of_other_routes_and_nowhere_else() -> None:
@@ -127,30 +134,10 @@ def test_leaders_are_seen_on_shared_lanes_of_other_routes_and_nowhere_else() -> 
     present = np.array([[True, True, True, True, False]])
     route, stage = np.array([[0, 1, 1, 0, 0]]), np.array([[0, 1, 0, 1, 1]])
     front_m = np.array([[8.0, 9.0, 5.5, 29.0, 20.0]])  # the second is 3 m along the shared lane, the fourth 19 m
+    boxes = new_boxes(5, 5.0, 2.0)[None]
+    boxes["length_m"][0, 3] = 7.0
     leader, gap_m = np.zeros((1, 5), np.int64), np.zeros((1, 5))
-    find_leaders(present, route, stage, front_m, lane_start_m, lane_on_route_m, 5.0, leader, gap_m)
-    assert leader.tolist() == [[1, 3, 1, -1, -1]]
-    assert gap_m[0, :3].tolist() == [13.0 - 8.0 - 5.0, 25.0 - 9.0 - 5.0, 9.0 - 5.5 - 5.0]
-    assert np.isnan(gap_m[0, 3:]).all()
-
-
-@given(CARS, CARS, CARS)
-def test_boxes_may_be_of_different_sizes(
-    ego: tuple[float, float, float], truck: tuple[float, float, float], bicycle: tuple[float, float, float]
-) -> None:
-    shapes = [VehicleShape(12.0, 2.5), BICYCLE]
-    vehicles = np.array([pose(*truck), pose(*bicycle), pose(*ego)], POSE)
-    length_m, width_m = (np.array([getattr(one, part) for one in [*shapes, SHAPE]]) for part in ("length_m", "width_m"))
-    found = np.empty(3)
-    measure_unlike_distances_m(
-        np.array([pose(*ego)], POSE)[0],
-        np.array([True, True, False]),
-        vehicles,
-        SHAPE.length_m,
-        SHAPE.width_m,
-        length_m,
-        width_m,
-        found,
-    )
-    wanted = [car(*ego).distance(car(*one, shape)) for one, shape in zip([truck, bicycle], shapes, strict=True)]
-    assert found.tolist() == pytest.approx([*wanted, math.inf], abs=1e-9)
+    find_leaders(present, route, stage, front_m, boxes, lane_start_m, lane_on_route_m, leader, gap_m)
+    assert leader.tolist() == [[1, 3, 1, NO_VEHICLE, NO_VEHICLE]]
+    assert gap_m[0, :3].tolist() == [13.0 - 8.0 - 5.0, 25.0 - 9.0 - 7.0, 9.0 - 5.5 - 5.0]
+    assert np.isinf(gap_m[0, 3:]).all()

@@ -10,7 +10,7 @@ import shapely
 from tint_sumo import ENV_IDS
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SCENES, T_INTERSECTION, EgoTask, Route, find_scene
-from tint_sumo.scenes.geometry import POSE, SPACING_M, measure_distances_m, place
+from tint_sumo.scenes.geometry import SPACING_M, Boxes, measure_distances_m, new_boxes, place
 from tint_sumo.scenes.layout import Layout, layout
 from tint_sumo.scenes.scene import register
 
@@ -19,9 +19,9 @@ LOWER, UPPER = 0, 1
 scenes = pytest.mark.parametrize("name", SCENES)
 
 
-def poses(way: np.ndarray, fronts_m: np.ndarray) -> np.ndarray:
-    found = np.zeros(len(fronts_m), POSE)
-    place(fronts_m, way, T.vehicle.length_m, found)
+def boxes(way: np.ndarray, fronts_m: np.ndarray) -> Boxes:
+    found = new_boxes(len(fronts_m), T.vehicle.length_m, T.vehicle.width_m)
+    place(fronts_m, way, found)
     return found
 
 
@@ -63,10 +63,10 @@ def test_the_ego_starts_beside_the_traffic_and_meets_every_route_before_its_goal
 def nearest_m(found: Layout, route: int, front_m: float) -> float:
     """How close the ego comes on its way to a vehicle that stands with its front there."""
     scene = found.scene
-    egos = poses(found.ego.way, np.arange(scene.ego.start_m, scene.ego.goal_m + 5.0, 0.02))
-    standing = np.repeat(poses(found.routes[route].way, np.array([front_m]))[None], len(egos), axis=0)
+    egos = boxes(found.ego.way, np.arange(scene.ego.start_m, scene.ego.goal_m + 5.0, 0.02))
+    standing = np.repeat(boxes(found.routes[route].way, np.array([front_m]))[None], len(egos), axis=0)
     distance_m = np.zeros((len(egos), 1))
-    measure_distances_m(egos, np.ones((len(egos), 1), bool), standing, np.inf, 5.0, 2.0, distance_m)
+    measure_distances_m(egos, np.ones((len(egos), 1), bool), standing, np.inf, distance_m)
     return float(distance_m.min())
 
 
@@ -85,7 +85,7 @@ def test_zones_of_the_t_intersection() -> None:
     assert zones.enter_m[LOWER] == pytest.approx(20.0)  # y = 0
     assert zones.inside_m[LOWER] == pytest.approx(21.0)
     assert np.isinf(zones.passed_m[UPPER])  # it stays there
-    front = poses(layout(T).ego.way, np.array([zones.enter_m[UPPER], zones.inside_m[UPPER], zones.passed_m[LOWER]]))
+    front = boxes(layout(T).ego.way, np.array([zones.enter_m[UPPER], zones.inside_m[UPPER], zones.passed_m[LOWER]]))
     front_y_m = front["y_m"] + 2.5 * front["heading_y"]
     assert front_y_m[:2].tolist() == pytest.approx([4.0, 5.0], abs=1e-3)
     assert front["y_m"][2] == pytest.approx(4.0, abs=1e-3)  # of the centre

@@ -7,8 +7,8 @@ import numpy as np
 
 from tint_sumo.config import DriverProfile
 from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene
+from tint_sumo.simulation import SceneSimulation
 from tint_sumo.simulation.demand import PlacedVehicle
-from tint_sumo.simulation.simulation import Simulation
 
 GO, CREEP, STOP = 3.0, 0.5, 0.0
 STEP_S = 0.1
@@ -18,9 +18,9 @@ T = find_scene(T_INTERSECTION)
 
 
 @contextmanager
-def scene(*vehicles: tuple[int, DriverProfile, float], played: Scene = T) -> Iterator[Simulation]:
+def scene(*vehicles: tuple[int, DriverProfile, float], played: Scene = T) -> Iterator[SceneSimulation]:
     """One intersection with vehicles given as (route, profile, x of the centre); slots in that order."""
-    simulation = Simulation(1, played)
+    simulation = SceneSimulation(1, played)
     try:
         simulation.reset_to(0, [_placed(simulation, *vehicle) for vehicle in vehicles])
         yield simulation
@@ -28,13 +28,13 @@ def scene(*vehicles: tuple[int, DriverProfile, float], played: Scene = T) -> Ite
         simulation.close()
 
 
-def _placed(simulation: Simulation, lane: int, profile: DriverProfile, x_m: float) -> PlacedVehicle:
+def _placed(simulation: SceneSimulation, lane: int, profile: DriverProfile, x_m: float) -> PlacedVehicle:
     member = next(index for index, one in enumerate(simulation.population) if one.profile is profile)
     driven_m = 20.0 - x_m if lane == LOWER else 20.0 + x_m
     return PlacedVehicle(lane, driven_m + 5.0, member)
 
 
-def until(simulation: Simulation, desired_mps: float, done: Callable[[], bool], limit_s: float = 60.0) -> None:
+def until(simulation: SceneSimulation, desired_mps: float, done: Callable[[], bool], limit_s: float = 60.0) -> None:
     """Drive until something is the case."""
     for _ in range(round(limit_s / STEP_S)):
         if done():
@@ -43,7 +43,7 @@ def until(simulation: Simulation, desired_mps: float, done: Callable[[], bool], 
     raise AssertionError("the scene did not come to its end")
 
 
-def stand_at(simulation: Simulation, path_m: float) -> None:
+def stand_at(simulation: SceneSimulation, path_m: float) -> None:
     """Drive the ego until its front stands about this far past the stem's end."""
 
     def must_brake() -> bool:
@@ -54,7 +54,7 @@ def stand_at(simulation: Simulation, path_m: float) -> None:
     until(simulation, STOP, lambda: bool(simulation.egos.speed_mps[0] < 1e-3))
 
 
-def speeds(simulation: Simulation, desired_mps: float, seconds: float = 12.0) -> list[float]:
+def speeds(simulation: SceneSimulation, desired_mps: float, seconds: float = 12.0) -> list[float]:
     """Speeds of the vehicle in slot 0 while the ego drives; ends when the vehicle leaves the street."""
     found = []
     for _ in range(round(seconds / STEP_S)):

@@ -13,25 +13,25 @@ from traci.storage import Storage
 from tests.scenes.networks import UserNetwork
 from tests.simulation.scenes import T
 from tint_sumo.core.errors import InputError
-from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation import SceneSimulation
 from tint_sumo.simulation.sumocfg import SumocfgSimulation, sumo_options
 
 
 def test_a_second_simulation_in_the_process_takes_traci_and_libsumo_comes_back() -> None:
-    first, second = Simulation(1, T), Simulation(1, T)
+    first, second = SceneSimulation(1, T), SceneSimulation(1, T)
     assert (first.backend, second.backend) == ("libsumo", "traci")
     with pytest.raises(InputError, match="libsumo already runs"):
-        Simulation(1, T, backend="libsumo")
+        SceneSimulation(1, T, backend="libsumo")
     first.close()
     first.close()
-    third = Simulation(1, T, backend="libsumo")
+    third = SceneSimulation(1, T, backend="libsumo")
     assert third.backend == "libsumo"
     second.close()
     third.close()
 
 
 def test_traci_when_asked_for() -> None:
-    simulation = Simulation(1, T, backend="traci")
+    simulation = SceneSimulation(1, T, backend="traci")
     assert simulation.backend == "traci"
     simulation.close()
 
@@ -39,7 +39,7 @@ def test_traci_when_asked_for() -> None:
 def test_half_an_answer_that_an_interrupt_has_left_does_not_keep_traci_from_closing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    simulation = Simulation(1, T, backend="traci")
+    simulation = SceneSimulation(1, T, backend="traci")
     traci_connection = simulation.link.connection.vehicle._connection
     monkeypatch.setattr(traci_connection, "_recvExact", lambda: Storage(b""))
     simulation.close()
@@ -61,8 +61,8 @@ def start_as_user(user_network: Callable[[str], UserNetwork]) -> Iterator[Callab
 def test_where_the_user_runs_libsumo_simulations_take_traci(start_as_user: Callable[[], None]) -> None:
     start_as_user()
     with pytest.raises(InputError, match="libsumo already runs a simulation in this process"):
-        Simulation(1, T, backend="libsumo")
-    simulation = Simulation(1, T)
+        SceneSimulation(1, T, backend="libsumo")
+    simulation = SceneSimulation(1, T)
     assert simulation.backend == "traci"
     simulation.reset(0, 0)
     simulation.close()
@@ -72,13 +72,13 @@ def test_where_the_user_runs_libsumo_simulations_take_traci(start_as_user: Calla
 def test_closing_never_ends_a_simulation_that_the_user_started_later(
     start_as_user: Callable[[], None], user_network: Callable[[str], UserNetwork]
 ) -> None:
-    closed = Simulation(1, T)
+    closed = SceneSimulation(1, T)
     closed.close()
     start_as_user()
     closed.close()
     del closed
     libsumo.close()
-    for make in (lambda: Simulation(1, T), lambda: SumocfgSimulation(user_network("merge").scene())):
+    for make in (lambda: SceneSimulation(1, T), lambda: SumocfgSimulation(1, user_network("merge").scene())):
         running = make()
         assert running.backend == "libsumo"
         start_as_user()  # libsumo ends the one that runs
@@ -88,7 +88,7 @@ def test_closing_never_ends_a_simulation_that_the_user_started_later(
 
 
 def test_libsumo_is_free_after_episodes_of_a_configuration(user_network: Callable[[str], UserNetwork]) -> None:
-    simulation = SumocfgSimulation(user_network("merge").scene(warm_up_s=0.0), backend="libsumo")
+    simulation = SumocfgSimulation(1, user_network("merge").scene(warm_up_s=0.0), backend="libsumo")
     simulation.reset(0, 1)
     simulation.close()
     assert not libsumo.isLoaded()
@@ -97,9 +97,9 @@ def test_libsumo_is_free_after_episodes_of_a_configuration(user_network: Callabl
 def test_threads_claim_libsumo_once_and_keep_their_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     start = libsumo.start
     monkeypatch.setattr(libsumo, "start", lambda command: (time.sleep(0.5), start(command)))  # lets the others go on
-    made: list[Simulation] = []
+    made: list[SceneSimulation] = []
     streams = sys.stdout, sys.stderr
-    threads = [threading.Thread(target=lambda: made.append(Simulation(1, T))) for _ in range(4)]
+    threads = [threading.Thread(target=lambda: made.append(SceneSimulation(1, T))) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -112,7 +112,7 @@ def test_threads_claim_libsumo_once_and_keep_their_streams(monkeypatch: pytest.M
 
 
 def test_a_forked_process_leaves_the_simulations_of_its_parent_alone() -> None:
-    simulations = [Simulation(1, T), Simulation(1, T)]
+    simulations = [SceneSimulation(1, T), SceneSimulation(1, T)]
     for simulation in simulations:
         simulation.reset(0, 1)
     child = os.fork()
@@ -120,7 +120,7 @@ def test_a_forked_process_leaves_the_simulations_of_its_parent_alone() -> None:
         try:
             for simulation in simulations:
                 simulation.close()
-            again = Simulation(1, T)
+            again = SceneSimulation(1, T)
             os._exit(0 if again.backend == "libsumo" else 1)
         finally:
             os._exit(2)
@@ -131,29 +131,29 @@ def test_a_forked_process_leaves_the_simulations_of_its_parent_alone() -> None:
 
 
 def test_a_forgotten_simulation_gives_libsumo_free() -> None:
-    simulation = Simulation(1, T, backend="libsumo")
+    simulation = SceneSimulation(1, T, backend="libsumo")
     del simulation
     gc.collect()
-    again = Simulation(1, T, backend="libsumo")
+    again = SceneSimulation(1, T, backend="libsumo")
     again.close()
 
 
 def test_unknown_backend() -> None:
     with pytest.raises(InputError, match="unknown backend 'gui'; choose auto, libsumo or traci"):
-        Simulation(1, T, backend="gui")  # type: ignore[arg-type]
+        SceneSimulation(1, T, backend="gui")  # type: ignore[arg-type]
 
 
 def test_traci_says_nothing_on_stdout(capfd: pytest.CaptureFixture[str]) -> None:
-    Simulation(1, T, backend="traci").close()
+    SceneSimulation(1, T, backend="traci").close()
     assert capfd.readouterr().out == ""
 
 
 def test_a_second_simulation_where_libsumo_stands_in_for_traci() -> None:
     """Users of other SUMO learning environments have this variable set; ``import traci`` then gives libsumo."""
     code = (
-        "from tint_sumo.simulation.simulation import Simulation\n"
+        "from tint_sumo.simulation import SceneSimulation\n"
         "from tint_sumo.scenes import find_scene\n"
-        "first, second = (Simulation(1, find_scene('t_intersection')) for _ in range(2))\n"
+        "first, second = (SceneSimulation(1, find_scene('t_intersection')) for _ in range(2))\n"
         "first.reset(0, 0), second.reset(0, 0), first.step(), second.step()\n"
         "assert (first.slots.front_m == second.slots.front_m).all() and first.slots.present.any()\n"
         "print(first.backend, second.backend)\n"

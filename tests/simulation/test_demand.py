@@ -10,6 +10,7 @@ from tests.simulation.scenes import T
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Population
 from tint_sumo.scenes import Scene
 from tint_sumo.scenes.drivers import members
+from tint_sumo.scenes.geometry import NO_VEHICLE
 from tint_sumo.scenes.layout import layout
 from tint_sumo.simulation.demand import Demand, DriverPool, DriverStream, admit
 from tint_sumo.simulation.slots import Slots
@@ -132,14 +133,17 @@ def test_an_episode_begins_with_vehicles_on_all_routes_and_goes_on_with_the_next
     assert {one.route for one in placed} == {0, 1}
     again = demand.begin(0, np.random.SeedSequence(3))
     assert again == placed != demand.begin(0, np.random.SeedSequence(4))
-    slots = Slots(2, layout(scene))
-    slots.newest[1] = slots.front_m[1] = 0
+    slots = Slots(2, scene.max_vehicles)
+    for route in (0, 1):
+        demand.enter(1, route, slot=0)
     assert list(demand.admit(slots, np.zeros(2))) == [(0, 0), (0, 1)]  # the other's roads are full
     upcoming = demand._streams[0][1].upcoming
     newcomer = demand.take(0, 1, 2.0)
     assert (newcomer.route, newcomer.front_m, newcomer.member) == (1, LENGTH_M, upcoming.member)
     assert demand._wanted_gap_m[0, 1] == demand._streams[0][1].upcoming.gap_m
+    demand.enter(0, 0, slot=1)
     demand.stop(0)
+    assert (demand._newest[0] == NO_VEHICLE).all()
     assert list(demand.admit(slots, np.full(2, 99.0))) == []
     assert not demand._wanted_time_s[0].any() and not demand._admitted.any() and demand._streams[0] == ()
 
@@ -148,7 +152,7 @@ def test_drivers_who_wait_come_after_their_time() -> None:
     scene = played(arrivals_per_s=0.1)
     demand = Demand(1, members(scene.population), layout(scene))
     demand.begin(0, np.random.SeedSequence(0))
-    slots = Slots(1, layout(scene))
+    slots = Slots(1, scene.max_vehicles)
     due_s = demand._streams[0][0].upcoming.wait_s
     assert (0, 0) not in list(demand.admit(slots, np.array([due_s - 1e-6])))
     assert (0, 0) in list(demand.admit(slots, np.array([due_s])))
@@ -158,13 +162,19 @@ def test_drivers_who_wait_come_after_their_time() -> None:
 
 def test_a_newcomer_keeps_its_gap_to_the_back_of_the_one_before() -> None:
     scene = played()
-    demand, slots = Demand(1, members(scene.population), layout(scene)), Slots(1, layout(scene))
+    demand, slots = Demand(1, members(scene.population), layout(scene)), Slots(1, scene.max_vehicles)
     demand.begin(0, np.random.SeedSequence(0))
-    slots.newest[0] = [3, 4]
+    demand.enter(0, 0, slot=3)
+    demand.enter(0, 1, slot=4)
     slots.front_m[0, 4] = 0.0
     for more_m, admitted in ((-1e-6, []), (1e-6, [(0, 0)])):
         slots.front_m[0, 3] = 2 * LENGTH_M + demand._streams[0][0].upcoming.gap_m + more_m
         assert list(demand.admit(slots, np.zeros(1))) == admitted
+    slots.front_m[0, 3] = 0.0
+    demand.leave(0, 0, slot=5)  # an older one
+    assert not list(demand.admit(slots, np.zeros(1)))
+    demand.leave(0, 0, slot=3)
+    assert list(demand.admit(slots, np.zeros(1))) == [(0, 0)]
 
 
 def test_mixes_are_drawn_from_the_range_of_the_traffic() -> None:

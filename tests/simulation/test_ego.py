@@ -1,3 +1,5 @@
+"""The ego's control and its safety check; nothing is simulated."""
+
 import math
 from dataclasses import replace
 from itertools import count, product
@@ -5,8 +7,9 @@ from itertools import count, product
 import numpy as np
 import pytest
 
+from tint_sumo.config import DRIVER_PROFILES
 from tint_sumo.scenes import T_INTERSECTION, find_scene
-from tint_sumo.scenes.geometry import POSE, pose_distance_m
+from tint_sumo.scenes.geometry import BOX, Boxes, clearance_m, place
 from tint_sumo.scenes.layout import layout
 from tint_sumo.simulation.ego import (
     Collision,
@@ -17,7 +20,6 @@ from tint_sumo.simulation.ego import (
     drive,
     is_behind,
     is_unsafe,
-    update_claims,
 )
 from tint_sumo.simulation.slots import Slots
 
@@ -64,41 +66,10 @@ def test_safety_check(distance_m: float, closing_mps: float, unsafe: bool) -> No
     assert is_unsafe(distance_m, closing_mps, RULES) == unsafe
 
 
-@pytest.mark.parametrize(
-    ("past_m", "speed_mps", "claimed"),
-    [
-        (-0.1, 3.0, False),
-        (0.1, 0.6, True),
-        (0.1, 0.5, False),  # creeping is no claim
-        (0.9, 0.0, False),  # nor is standing short of the vehicles' path
-        (1.1, 0.0, True),
-    ],
-)
-def test_claims_on_the_first_lane(past_m: float, speed_mps: float, claimed: bool) -> None:
-    egos = Egos(1, layout(T))
-    egos.front_m[0], egos.speed_mps[0] = layout(T).zones.enter_m[0] + past_m, speed_mps
-    assert egos.update_claims() == claimed
-    assert egos.has_claimed.tolist() == [[claimed, False]]
-    assert not egos.update_claims()
-
-
-def test_speed_along_a_lane_is_no_claim_on_it() -> None:
-    """In its turn the ego comes closer to the second lane by only a part of its speed."""
-    zones = layout(T).zones
-    egos = Egos(1, layout(T))
-    egos.front_m[0] = zones.enter_m[1] + 0.1
-    for speed_mps, claimed in ((0.6, False), (0.7, True)):
-        egos.speed_mps[0] = speed_mps
-        egos.update_claims()
-        assert egos.has_claimed.tolist() == [[True, claimed]]
-
-
 def test_the_rules_are_those_of_the_scene() -> None:
     controller = replace(T.ego.controller, **dict(zip(CONTROLLER, count(2.0), strict=False)), watches_behind=False)
-    claim, vehicle = replace(T.claim, approach_speed_mps=0.75), replace(T.vehicle, length_m=4.0)
-    changed = replace(T, ego=replace(T.ego, controller=controller), claim=claim, vehicle=vehicle, step_s=0.05)
-    rules = EgoRules.of(changed)
-    assert rules == EgoRules(*(getattr(controller, name) for name in CONTROLLER), 0.75, False, 2.0, 0.05, 0.02)
+    rules = EgoRules.of(replace(T, ego=replace(T.ego, controller=controller), step_s=0.05))
+    assert rules == EgoRules(*(getattr(controller, name) for name in CONTROLLER), False, 0.05)
 
 
 def test_egos_move_by_their_new_speed_and_never_backwards() -> None:
@@ -114,8 +85,9 @@ def test_at_its_very_limits_the_ego_is_safe(distance_m: float, closing_mps: floa
     assert not is_unsafe(distance_m, closing_mps, RULES)
 
 
-def poses(*values: tuple[float, float, float, float]) -> np.ndarray:
-    return np.array(list(values), POSE)
+def boxes(*values: tuple[float, float, float, float]) -> Boxes:
+    """Return boxes of 5 m by 2 m by their centres and headings."""
+    return np.array([(*value, 5.0, 2.0) for value in values], BOX)
 
 
 @pytest.mark.parametrize(
@@ -123,10 +95,10 @@ def poses(*values: tuple[float, float, float, float]) -> np.ndarray:
     [(10.0, 17.4, True), (10.0, 17.6, False), (15.0, 17.4, True), (15.0, 17.6, False), (10.0, 25.0, False)],
 )
 def test_behind_is_what_lies_behind_the_back(x_m: float, y_m: float, behind: bool) -> None:
-    ego, vehicle = poses((10.0, 20.0, 0.0, 1.0), (x_m, y_m, 1.0, 0.0))
-    assert is_behind(vehicle, ego, 2.5) == behind
-    ego, vehicle = poses((20.0, 10.0, -1.0, 0.0), (40.0 - y_m, x_m, 0.0, 1.0))
-    assert is_behind(vehicle, ego, 2.5) == behind
+    ego, vehicle = boxes((10.0, 20.0, 0.0, 1.0), (x_m, y_m, 1.0, 0.0))
+    assert is_behind(vehicle, ego) == behind
+    ego, vehicle = boxes((20.0, 10.0, -1.0, 0.0), (40.0 - y_m, x_m, 0.0, 1.0))
+    assert is_behind(vehicle, ego) == behind
 
 
 NEAR, FAR, AWAY = 0.5, 5.0, math.inf
@@ -138,8 +110,8 @@ def checked(
 ) -> tuple[bool, bool, int]:
     """Whether one ego is unsafe, whether it has newly touched a vehicle, and which one."""
     unsafe, hit = np.array([True]), np.array([-1])
-    egos = poses((0.0, 0.0, 0.0, 1.0))
-    new = check_safety(np.array([now_m]), np.array([before_m]), egos, poses(*vehicles)[None], rules, unsafe, hit)
+    egos = boxes((0.0, 0.0, 0.0, 1.0))
+    new = check_safety(np.array([now_m]), np.array([before_m]), egos, boxes(*vehicles)[None], rules, unsafe, hit)
     return bool(unsafe[0]), bool(new), int(hit[0])
 
 
@@ -173,106 +145,85 @@ def test_the_first_vehicle_that_is_touched_is_kept() -> None:
     assert checked([FAR, 0.0, 0.0], [FAR, 0.1, 0.1], [AHEAD] * 3, RULES) == (True, True, 1)
     assert checked([0.0], [0.1], [AHEAD], RULES) == (True, True, 0)
     unsafe, hit = np.array([False, False]), np.array([2, -1])
-    egos, vehicles = poses(*[(0.0, 0.0, 0.0, 1.0)] * 2), np.stack([poses(AHEAD)] * 2)
+    egos, vehicles = boxes(*[(0.0, 0.0, 0.0, 1.0)] * 2), np.stack([boxes(AHEAD)] * 2)
     assert not check_safety(np.array([[0.0], [FAR]]), np.full((2, 1), FAR), egos, vehicles, RULES, unsafe, hit)
     assert hit.tolist() == [2, -1] and unsafe.tolist() == [True, False]
 
 
-@pytest.mark.parametrize(
-    ("front_m", "speed_mps", "claimed"),
-    [
-        (10.0, 3.0, False),  # not yet past the border
-        (10.01, 0.51, True),
-        (10.01, 0.5, False),
-        (11.0, 0.0, False),
-        (11.01, 0.0, True),
-        (19.0, 0.6, True),  # beyond its way's last point, that one counts
-        (-1.0, 3.0, False),
-    ],
-)
-def test_a_claim_is_an_ego_past_the_border_that_moves_in_or_stands_in_the_path(
-    front_m: float, speed_mps: float, claimed: bool
-) -> None:
-    towards = np.array([[1.0] * 600, [0.0] * 600])
-    zones = np.array([10.0, 10.0]), np.array([11.0, 99.0]), towards
-    before, changed = np.zeros((1, 2), bool), np.ones((1, 2), bool)
-    now = np.array([front_m]), np.array([speed_mps])
-    assert update_claims(*now, *zones, RULES, before, changed) == claimed
-    assert before.tolist() == changed.tolist() == [[claimed, False]]
-    assert not update_claims(*now, *zones, RULES, before, changed) and not changed.any()
-    assert before.tolist() == [[claimed, False]]
-    assert update_claims(np.zeros(1), np.zeros(1), *zones, RULES, before, changed) == claimed
-    assert changed.tolist() == [[claimed, False]] and not before.any()
-
-
-def test_the_direction_counts_where_the_ego_is() -> None:
-    towards = np.zeros((1, 600))
-    towards[0, 550] = 1.0  # at 11 m
-    zones = np.array([10.0]), np.array([99.0]), towards
-    for front_m, claimed in ((11.0001, True), (11.0201, False), (10.9999, False)):
-        found = np.zeros((1, 1), bool)
-        update_claims(np.array([front_m]), np.array([3.0]), *zones, RULES, found, np.zeros((1, 1), bool))
-        assert found[0, 0] == claimed, front_m
-
-
-def test_an_ego_begins_at_its_start_and_is_forgotten_whole() -> None:
-    egos = Egos(2, layout(T))
-    egos.begin(1)
-    assert egos.front_m.tolist() == [0.0, T.ego.start_m] and not egos.collided.any()
-    assert (egos.pose["x_m"][1], egos.pose["y_m"][1]) == pytest.approx((0.0, T.ego.start_m - 22.5))
+def test_a_cleared_ego_is_as_new() -> None:
+    egos = Egos(2, T)
+    assert egos.box["length_m"].tolist() == [5.0, 5.0] and egos.box["width_m"].tolist() == [2.0, 2.0]
     fresh = {name: value.copy() for name, value in vars(egos).items() if isinstance(value, np.ndarray)}
     egos.front_m[1] = egos.speed_mps[1] = egos.distance_m[1] = egos._was_distance_m[1] = 3.0
-    egos.unsafe[1] = egos.has_claimed[1] = egos.claim_changed[1] = True
+    egos.unsafe[1] = True
+    egos.box[1] = (1.0, 2.0, 1.0, 0.0, 5.0, 2.0)
     egos._hit_slot[1], egos.collision[1] = 4, Collision(4, 0, "lower", 0.0, 0.0)
     assert egos.collided.tolist() == [False, True]
-    egos.begin(1)
+    egos.clear(1)
     assert all(getattr(egos, name).tolist() == value.tolist() for name, value in fresh.items())
     assert egos.collision == [None, None]
 
 
-def test_an_ego_looks_around_and_remembers_the_first_collision() -> None:
-    egos, slots = Egos(1, layout(T)), Slots(1, layout(T))
-    egos.begin(0)
-    egos.look_around(slots)
-    assert np.isinf(egos.distance_m).all() and not egos.unsafe[0] and egos.collision == [None]
-    egos.front_m[0] = 25.0
-    egos.drive(np.array([0.0]))
-    slots.take(0, 3, 0, 25.0, member=9, number=0)  # its centre is at x = 0 on the lower lane, as the ego's is nearly
-    egos.look_around(slots)
+def set_ego(egos: Egos, front_m: float) -> None:
+    egos.front_m[0] = front_m
+    place(egos.front_m, layout(T).ego.way, egos.box)
+
+
+def set_vehicle(slots: Slots, slot: int, route: int, front_m: float) -> None:
+    slots.take(0, slot, route=route, member=9, number=0, length_m=5.0, width_m=2.0)
+    place(np.array([front_m]), layout(T).routes[route].way, slots.box[0, slot : slot + 1])
+
+
+def test_an_ego_looks_around_and_tells_its_first_collision_alone() -> None:
+    egos, slots = Egos(1, T), Slots(1, T.max_vehicles)
+    set_ego(egos, T.ego.start_m)
+    assert not egos.look_around(slots)
+    assert np.isinf(egos.distance_m).all() and not egos.unsafe[0]
+    set_ego(egos, 25.0)
+    set_vehicle(slots, 3, 0, 25.0)  # its centre is at x = 0 on the lower lane, as the ego's is nearly
+    assert egos.look_around(slots) == [(0, 3)]
     assert egos.distance_m[0, 3] == 0.0 and np.isinf(np.delete(egos.distance_m[0], 3)).all()
     assert egos.unsafe[0] and egos.collided[0]
-    hit = egos.collision[0]
-    assert hit is not None and (hit.slot, hit.member, hit.route) == (3, 9, "lower")
-    assert (hit.ego_x_m, hit.ego_y_m) == (egos.pose["x_m"][0], egos.pose["y_m"][0])
-    slots.take(0, 5, 0, 25.0, member=2, number=1)
-    egos.look_around(slots)
-    assert egos.collision[0] is hit
+    set_vehicle(slots, 5, 0, 25.0)
+    assert not egos.look_around(slots)
 
 
-def test_vehicles_are_followed_from_so_far_that_closing_is_known() -> None:
-    """A metre before they are close enough to count, and a step later they are not yet."""
-    egos, slots = Egos(1, layout(T)), Slots(1, layout(T))
+def test_a_collision_that_is_known_is_not_told_again_when_another_ego_has_one() -> None:
+    egos, slots = Egos(2, T), Slots(2, T.max_vehicles)
+    egos.box[1] = egos.box[0] = (0.0, 0.0, 1.0, 0.0, 5.0, 2.0)
+    slots.take(0, 1, member=0, number=0, length_m=5.0, width_m=2.0)
+    slots.box[0, 1] = egos.box[0]
+    assert egos.look_around(slots) == [(0, 1)]
+    egos.collision[0] = Collision(1, 0, "lower", 0.0, 0.0)
+    slots.take(1, 2, member=0, number=0, length_m=5.0, width_m=2.0)
+    slots.box[1, 2] = egos.box[1]
+    assert egos.look_around(slots) == [(1, 2)]
+
+
+@pytest.mark.parametrize("step_s", [0.1, 1.0])
+def test_vehicles_are_followed_from_so_far_that_closing_is_known(step_s: float) -> None:
+    """Up to a step before they are close enough to count, and a step later they are not yet."""
+    egos, slots = Egos(1, replace(T, step_s=step_s)), Slots(1, T.max_vehicles)
+    fastest_mps = T.ego.controller.desired_speeds_mps[-1] + max(one.desired_speed_mps[1] for one in DRIVER_PROFILES)
     seen_m = []
     for ego_m in (19.1, 24.0, 28.0, 33.0):
-        egos.front_m[0] = ego_m
-        egos.drive(np.array([0.0]))
+        set_ego(egos, ego_m)
         for route, front_m in product((0, 1), np.arange(5.5, 45.0, 0.5)):
-            slots.take(0, 0, route, front_m, member=0, number=0)
+            set_vehicle(slots, 0, route, front_m)
             egos.look_around(slots)
-            distance_m = pose_distance_m(egos.pose[0], slots.pose[0, 0], 5.0, 2.0, 5.0, 2.0)
-            if distance_m < 2.0:
+            distance_m = clearance_m(egos.box[0], slots.box[0, 0])
+            if distance_m < T.ego.controller.closing_distance_m + fastest_mps * step_s:
                 assert egos.distance_m[0, 0] == pytest.approx(distance_m)
                 seen_m.append(distance_m)
-    assert sum(distance_m > 1.0 for distance_m in seen_m) > 20
+    assert sum(distance_m > 1.0 for distance_m in seen_m) > 15
 
 
 def test_a_vehicle_that_has_just_appeared_was_infinitely_far() -> None:
-    egos, slots = Egos(1, layout(T)), Slots(1, layout(T))
-    egos.begin(0)
+    egos, slots = Egos(1, T), Slots(1, T.max_vehicles)
+    set_ego(egos, T.ego.start_m)
     egos.look_around(slots)
-    egos.front_m[0] = 19.1  # 0.9 m short of the lower lane, whose vehicles are 2 m wide and drive in its middle
-    egos.drive(np.array([0.0]))
-    slots.take(0, 0, 0, 22.5, member=0, number=0)
+    set_ego(egos, 19.1)  # 0.9 m short of the lower lane, whose vehicles are 2 m wide and drive in its middle
+    set_vehicle(slots, 0, 0, 22.5)
     egos.look_around(slots)
     assert egos.distance_m[0, 0] == pytest.approx(1.9, abs=0.01)
     assert np.isinf(egos._was_distance_m[0, 0])

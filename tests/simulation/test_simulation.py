@@ -11,19 +11,20 @@ from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, EgoController, Idm, Popul
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SCENES, Scene, find_scene
 from tint_sumo.scenes.geometry import measure_distances_m
+from tint_sumo.simulation import SceneSimulation
 from tint_sumo.simulation.demand import PlacedVehicle
 from tint_sumo.simulation.ego import EgoRules, is_unsafe
-from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.simulation.sumo import NO_COLLISION_CHECK, SUMO_COLLISION_CHECK
 
 SLOTS = ("present", "route", "front_m", "member", "vehicle_number")
-EGOS = ("front_m", "speed_mps", "has_claimed", "collided")
+EGOS = ("front_m", "speed_mps", "collided")
 
 
-def state(simulation: Simulation) -> dict[str, Any]:
+def state(simulation: SceneSimulation) -> dict[str, Any]:
     """Copies of what is known of all replicas; what stands in empty slots is of no account."""
     slots = {key: np.where(simulation.slots.present, getattr(simulation.slots, key), -1) for key in SLOTS}
-    return slots | {f"ego_{key}": getattr(simulation.egos, key).copy() for key in EGOS}
+    egos = {f"ego_{key}": getattr(simulation.egos, key).copy() for key in EGOS}
+    return slots | egos | {"has_claimed": simulation.yielding.has_claimed.copy()}
 
 
 def in_traffic(p_conservative: float | tuple[float, float], **changes: Any) -> Scene:
@@ -33,7 +34,7 @@ def in_traffic(p_conservative: float | tuple[float, float], **changes: Any) -> S
 DESIRED_MPS = np.array([0.0, 0.5, 3.0])
 
 
-def history(simulation: Simulation, replica: int, seed: int, steps: int = 150) -> list[dict[str, Any]]:
+def history(simulation: SceneSimulation, replica: int, seed: int, steps: int = 150) -> list[dict[str, Any]]:
     """States of one replica under random actions that depend on the seed alone; other replicas stand."""
     rng = np.random.default_rng(seed)
     simulation.reset(replica, seed)
@@ -53,8 +54,8 @@ def assert_same(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> No
 
 
 @pytest.fixture(scope="module")
-def batch() -> Iterator[Simulation]:
-    simulation = Simulation(20, T)
+def batch() -> Iterator[SceneSimulation]:
+    simulation = SceneSimulation(20, T)
     for replica in range(20):
         simulation.reset(replica, 1000 + replica)
     yield simulation
@@ -62,11 +63,11 @@ def batch() -> Iterator[Simulation]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_an_episode_depends_on_its_seed_alone(batch: Simulation, seed: int) -> None:
+def test_an_episode_depends_on_its_seed_alone(batch: SceneSimulation, seed: int) -> None:
     """The same in another replica, at another time, beside other episodes, and in a simulation of its own."""
     first = history(batch, 3, seed)
     assert_same(first, history(batch, 19, seed))
-    alone = Simulation(1, T)
+    alone = SceneSimulation(1, T)
     try:
         assert alone.backend == "traci"  # libsumo is taken by the batch
         assert_same(first, history(alone, 0, seed))
@@ -74,15 +75,15 @@ def test_an_episode_depends_on_its_seed_alone(batch: Simulation, seed: int) -> N
         alone.close()
 
 
-def test_other_seeds_give_other_episodes(batch: Simulation) -> None:
+def test_other_seeds_give_other_episodes(batch: SceneSimulation) -> None:
     with pytest.raises(AssertionError):
         assert_same(history(batch, 0, 1), history(batch, 0, 2))
 
 
 @pytest.fixture(scope="module")
-def crowd() -> Iterator[tuple[Simulation, list[Any]]]:
+def crowd() -> Iterator[tuple[SceneSimulation, list[Any]]]:
     """60 intersections with driving egos, and what happened in them."""
-    simulation = Simulation(60, in_traffic(0.25))
+    simulation = SceneSimulation(60, in_traffic(0.25))
     rng = np.random.default_rng(0)
     for replica in range(60):
         simulation.reset(replica, [7, replica])
@@ -98,8 +99,8 @@ def crowd() -> Iterator[tuple[Simulation, list[Any]]]:
     simulation.close()
 
 
-def test_vehicles_keep_their_slots_and_slots_rest_between_vehicles(crowd: tuple[Simulation, list[Any]]) -> None:
-    simulation = Simulation(8, T)
+def test_vehicles_keep_their_slots_and_slots_rest_between_vehicles(crowd: tuple[SceneSimulation, list[Any]]) -> None:
+    simulation = SceneSimulation(8, T)
     try:
         for replica in range(8):
             simulation.reset(replica, replica)
@@ -117,7 +118,7 @@ def test_vehicles_keep_their_slots_and_slots_rest_between_vehicles(crowd: tuple[
         simulation.close()
 
 
-def test_vehicles_never_overlap_each_other_and_stay_on_the_street(crowd: tuple[Simulation, list[Any]]) -> None:
+def test_vehicles_never_overlap_each_other_and_stay_on_the_street(crowd: tuple[SceneSimulation, list[Any]]) -> None:
     _, states = crowd
     for one in states:
         for lane in (LOWER, UPPER):
@@ -129,7 +130,7 @@ def test_vehicles_never_overlap_each_other_and_stay_on_the_street(crowd: tuple[S
         assert (one["present"] > 0).sum(axis=1).max() <= T.max_vehicles
 
 
-def test_traits_are_drawn_with_their_probability(crowd: tuple[Simulation, list[Any]]) -> None:
+def test_traits_are_drawn_with_their_probability(crowd: tuple[SceneSimulation, list[Any]]) -> None:
     simulation, states = crowd
     yields = np.array([member.profile.yields for member in simulation.population])
     drawn = yields[states[0]["member"][states[0]["present"] > 0]]
@@ -138,7 +139,7 @@ def test_traits_are_drawn_with_their_probability(crowd: tuple[Simulation, list[A
     assert drawn.mean() == pytest.approx(0.25, abs=spread)
 
 
-def test_gaps_at_placement_are_those_of_the_follower(crowd: tuple[Simulation, list[Any]]) -> None:
+def test_gaps_at_placement_are_those_of_the_follower(crowd: tuple[SceneSimulation, list[Any]]) -> None:
     simulation, states = crowd
     first = states[0]
     gaps: dict[str, list[float]] = {"conservative": [], "aggressive": []}
@@ -158,7 +159,7 @@ def test_gaps_at_placement_are_those_of_the_follower(crowd: tuple[Simulation, li
 
 
 def test_newcomers_find_the_room_they_want() -> None:
-    simulation = Simulation(8, T)
+    simulation = SceneSimulation(8, T)
     try:
         for replica in range(8):
             simulation.reset(replica, [5, replica])
@@ -182,7 +183,7 @@ def test_newcomers_find_the_room_they_want() -> None:
 
 def test_poisson_arrivals_are_sparser_than_saturated_ones_and_have_their_rate() -> None:
     rate_per_s, seconds, replicas = 0.1, 60, 40
-    simulation = Simulation(replicas, replace(T, traffic=Traffic(arrivals_per_s=rate_per_s)), with_ego=False)
+    simulation = SceneSimulation(replicas, replace(T, traffic=Traffic(arrivals_per_s=rate_per_s)), with_ego=False)
     try:
         for replica in range(replicas):
             simulation.reset(replica, replica)
@@ -231,7 +232,7 @@ def test_the_modelled_ego_is_where_sumo_has_it(name: str) -> None:
         while simulation.egos.front_m[0] < played.ego.goal_m:
             simulation.step(np.array([rng.choice([0.5, 3.0, 3.0])]))
             ego_id = simulation.link.ego_ids[0]
-            pose = simulation.egos.pose[0]
+            pose = simulation.egos.box[0]
             front = (pose["x_m"] + half_m * pose["heading_x"], pose["y_m"] + half_m * pose["heading_y"])
             assert vehicle.getSpeed(ego_id) == pytest.approx(simulation.egos.speed_mps[0], abs=1e-9)
             assert vehicle.getPosition(ego_id) == pytest.approx(front, abs=0.02)
@@ -241,7 +242,7 @@ def test_the_modelled_ego_is_where_sumo_has_it(name: str) -> None:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_vehicles_are_where_sumo_has_them(name: str) -> None:
-    simulation = Simulation(3, find_scene(name))
+    simulation = SceneSimulation(3, find_scene(name))
     try:
         for replica in range(3):
             simulation.reset(replica, replica)
@@ -251,10 +252,12 @@ def test_vehicles_are_where_sumo_has_them(name: str) -> None:
             for _ in range(15):
                 simulation.step(np.zeros(3))
             for replica, slot in np.argwhere(slots.present):
-                vehicle_id, pose = simulation.link.ids[replica][slot], slots.pose[replica, slot]
+                vehicle_id, pose = simulation.link.ids[replica][slot], slots.box[replica, slot]
                 lanes = simulation.layout.routes[slots.route[replica, slot]].lanes
                 front = (pose["x_m"] + half_m * pose["heading_x"], pose["y_m"] + half_m * pose["heading_y"])
-                assert vehicle.getLaneID(vehicle_id) == lanes[slots.stage[replica, slot]].format(replica=replica)
+                assert vehicle.getLaneID(vehicle_id) == lanes[simulation.lanes.stage[replica, slot]].format(
+                    replica=replica
+                )
                 assert vehicle.getPosition(vehicle_id) == pytest.approx(front, abs=0.02)
     finally:
         simulation.close()
@@ -262,7 +265,7 @@ def test_vehicles_are_where_sumo_has_them(name: str) -> None:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_leaders_and_gaps_are_sumos(name: str) -> None:
-    simulation = Simulation(3, find_scene(name), with_ego=False)
+    simulation = SceneSimulation(3, find_scene(name), with_ego=False)
     try:
         for replica in range(3):
             simulation.reset(replica, replica)
@@ -286,23 +289,23 @@ def test_leaders_and_gaps_are_sumos(name: str) -> None:
         simulation.close()
 
 
-def ego_distances_m(simulation: Simulation) -> Any:
+def ego_distances_m(simulation: SceneSimulation) -> Any:
     distance_m, slots = np.empty(simulation.slots.present.shape), simulation.slots
-    measure_distances_m(simulation.egos.pose, slots.present, slots.pose, np.inf, 5.0, 2.0, distance_m)
+    measure_distances_m(simulation.egos.box, slots.present, slots.box, np.inf, distance_m)
     return distance_m
 
 
-def careless(replicas: int, collision_options: Sequence[str]) -> Simulation:
+def careless(replicas: int, collision_options: Sequence[str]) -> SceneSimulation:
     """Egos without a safety check among drivers who mostly do not yield."""
     controller = EgoController(unsafe_distance_m=0.0, closing_distance_m=0.0)
     played = in_traffic(0.2, ego=replace(T.ego, controller=controller))
-    simulation = Simulation(replicas, played, collision_options=collision_options)
+    simulation = SceneSimulation(replicas, played, collision_options=collision_options)
     for replica in range(replicas):
         simulation.reset(replica, [3, replica])
     return simulation
 
 
-def hits_by_sumo(simulation: Simulation) -> dict[int, int]:
+def hits_by_sumo(simulation: SceneSimulation) -> dict[int, int]:
     """Replica to slot of the vehicles that SUMO says collide with an ego now."""
     hits = {}
     for event in simulation.link.connection.simulation.getCollisions():
@@ -363,7 +366,7 @@ def test_traffic_is_the_same_whether_or_not_sumo_looks_for_collisions() -> None:
 def test_the_safety_check_misses_no_vehicle() -> None:
     """It looks only at vehicles nearby; all of them, looked at one by one, say the same."""
     replicas = 20
-    simulation = Simulation(replicas, T)
+    simulation = SceneSimulation(replicas, T)
     try:
         for replica in range(replicas):
             simulation.reset(replica, [6, replica])
@@ -391,7 +394,7 @@ def test_the_safety_check_misses_no_vehicle() -> None:
 
 
 def test_a_cleared_replica_is_empty_and_stays_so() -> None:
-    simulation = Simulation(2, T)
+    simulation = SceneSimulation(2, T)
     try:
         for replica in range(2):
             simulation.reset(replica, replica)
@@ -420,7 +423,7 @@ def test_a_scene_holds_at_most_twelve_vehicles() -> None:
 
 def test_a_range_gives_each_episode_a_mix_of_its_own() -> None:
     replicas = 60
-    simulation = Simulation(replicas, in_traffic((0.1, 0.9)), with_ego=False)
+    simulation = SceneSimulation(replicas, in_traffic((0.1, 0.9)), with_ego=False)
     try:
         for replica in range(replicas):
             simulation.reset(replica, replica)
@@ -432,8 +435,8 @@ def test_a_range_gives_each_episode_a_mix_of_its_own() -> None:
         simulation.close()
 
 
-def test_a_range_of_one_number_is_that_number(batch: Simulation) -> None:
-    single = Simulation(1, in_traffic((0.4, 0.4)), backend="traci")
+def test_a_range_of_one_number_is_that_number(batch: SceneSimulation) -> None:
+    single = SceneSimulation(1, in_traffic((0.4, 0.4)), backend="traci")
     try:
         assert_same(history(single, 0, seed=3), history(batch, 1, seed=3))
     finally:
@@ -453,7 +456,7 @@ def test_a_scene_of_few_slots_begins_with_those_who_have_come_furthest() -> None
 
 def _fronts_at_the_beginning(slots: int) -> list[list[float]]:
     """Of some episodes, in the order of the distances."""
-    simulation = Simulation(1, replace(T, max_vehicles=slots), with_ego=False)
+    simulation = SceneSimulation(1, replace(T, max_vehicles=slots), with_ego=False)
     fronts_m = []
     for seed in range(5):
         simulation.reset(0, seed)

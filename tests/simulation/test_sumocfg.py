@@ -14,14 +14,15 @@ from tests.scenes.networks import USER_NETWORKS, UserNetwork, write_config
 from tint_sumo.config import Backend, EgoController
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SumocfgScene
-from tint_sumo.simulation.sumocfg import EGO, SumocfgSimulation, make_simulation
+from tint_sumo.simulation import SumocfgSimulation, make_simulation
+from tint_sumo.simulation.sumocfg import EGO
 
 Make = Callable[[str], UserNetwork]
 
 
 @contextmanager
 def begun(scene: SumocfgScene, seed: int = 1, backend: Backend = "auto") -> Iterator[SumocfgSimulation]:
-    simulation = SumocfgSimulation(scene, backend)
+    simulation = SumocfgSimulation(1, scene, backend=backend)
     try:
         simulation.reset(0, seed)
         yield simulation
@@ -48,12 +49,12 @@ def test_the_ego_reaches_its_goal_in_every_network(user_network: Make) -> None:
             egos = simulation.egos
             assert egos.front_m[0] == scene.start_m
             assert egos.speed_mps[0] == 0.0
-            assert abs(egos.pose["x_m"][0]) + abs(egos.pose["y_m"][0]) < 1e-9
+            assert abs(egos.box["x_m"][0]) + abs(egos.box["y_m"][0]) < 1e-9
             for _ in drive(simulation, round(120.0 / scene.step_s)):
                 front_m.append(egos.front_m[0])
             assert egos.collided[0] or egos.front_m[0] > scene.goal_m, name
             assert (np.diff(front_m) >= 0.0).all()
-            assert np.hypot(egos.pose["heading_x"], egos.pose["heading_y"])[0] == pytest.approx(1.0)
+            assert np.hypot(egos.box["heading_x"], egos.box["heading_y"])[0] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("name", ["braunschweig", "merge"])
@@ -69,13 +70,13 @@ def test_slots_hold_the_nearest_vehicles_and_rest_between_two(name: str, user_ne
             away_m = {one: math.dist(ego_m, vehicle.getPosition(one)) for one in vehicle.getIDList() if one != EGO}
             inside = sorted((one for one in away_m if away_m[one] <= sight_m), key=lambda one: away_m[one])
             crowds += len(inside) > 3
-            assert set(slots.slot) <= set(inside[:3])
+            assert set(simulation.slot) <= set(inside[:3])
             numbers = slots.vehicle_number[0].copy()
             changed = numbers != before
             assert ((before[changed] == -1) | (numbers[changed] == -1)).all()
             np.testing.assert_array_equal(slots.present[0], numbers >= 0)
             np.testing.assert_array_equal(slots.member[0] >= 0, slots.present[0])
-            for one, slot in slots.slot.items():
+            for one, slot in simulation.slot.items():
                 assert scene.vtypes[slots.member[0, slot]] == vehicle.getTypeID(one)
                 assert slots.width_m[0, slot] == vehicle.getWidth(one)
             before = numbers
@@ -89,11 +90,11 @@ def test_distances_are_those_of_boxes_of_each_vehicles_size(user_network: Make) 
         seen = set()
         for step in drive(simulation, 300):
             if step % 30 == 0:
-                ego = _box(egos.pose[0], 5.0, 2.0)
+                ego = _box(egos.box[0], 5.0, 2.0)
                 for slot in np.flatnonzero(slots.present[0]).tolist():
                     size_m = float(slots.length_m[0, slot]), float(slots.width_m[0, slot])
                     seen.add(size_m)
-                    other = _box(slots.pose[0, slot], *size_m)
+                    other = _box(slots.box[0, slot], *size_m)
                     assert egos.distance_m[0, slot] == pytest.approx(ego.distance(other), abs=1e-6)
         assert len(seen) > 1
 
@@ -147,11 +148,11 @@ def test_an_episode_depends_on_its_seed_alone_whatever_the_backend(user_network:
         simulation.reset(0, seed)
         slots, egos = simulation.slots, simulation.egos
         return [
-            slots.pose[slots.present].tobytes() + egos.pose.tobytes() + simulation.leaders()[1].tobytes()
+            slots.box[slots.present].tobytes() + egos.box.tobytes() + simulation.leaders()[1].tobytes()
             for _ in drive(simulation, 150)
         ]
 
-    first, second = SumocfgSimulation(scene), SumocfgSimulation(scene)
+    first, second = SumocfgSimulation(1, scene), SumocfgSimulation(1, scene)
     try:
         assert (first.backend, second.backend) == ("libsumo", "traci")
         once = lived(first, 1)
@@ -171,7 +172,7 @@ def test_leaders_are_seen_with_gaps_from_bumper_to_bumper(user_network: Make) ->
         for _ in drive(simulation, 200, desired_mps=0.0):
             leader, gap_m = simulation.leaders()
             for slot in np.flatnonzero(leader[0] >= 0).tolist():
-                own, ahead = slots.pose[0, slot], slots.pose[0, leader[0, slot]]
+                own, ahead = slots.box[0, slot], slots.box[0, leader[0, slot]]
                 straight = own["heading_x"] > 0.999 and ahead["heading_x"] > 0.999
                 if straight and abs(own["y_m"] - ahead["y_m"]) < 0.1:
                     assert gap_m[0, slot] == pytest.approx(ahead["x_m"] - own["x_m"] - 5.0, abs=0.2)
@@ -214,7 +215,7 @@ def test_demand_that_sumo_refuses_is_told_in_one_line(user_network: Make) -> Non
     scene = UserNetwork(sumocfg, network.ego_route, 20.0, 100.0).scene()
     for backend in ("libsumo", "traci"):
         with pytest.raises(InputError, match=r"SUMO does not run .*wrong\.sumocfg") as caught:
-            SumocfgSimulation(scene, backend)
+            SumocfgSimulation(1, scene, backend=backend)
         assert "\n" not in str(caught.value)
 
 

@@ -8,8 +8,8 @@ from tests.simulation.scenes import GO, LOWER, UPPER, T, scene, until
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DriverProfile
 from tint_sumo.scenes import Scene
 from tint_sumo.scenes.layout import layout
+from tint_sumo.simulation import SceneSimulation
 from tint_sumo.simulation.demand import PlacedVehicle
-from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.study import ceiling as module
 from tint_sumo.study.ceiling import _finishes, _openings, ceiling, way_m
 
@@ -22,9 +22,9 @@ YIELDS_BELOW, YIELDS_ABOVE = (LOWER, CONSERVATIVE, 12.0), (UPPER, CONSERVATIVE, 
 
 
 @contextmanager
-def street(*vehicles: Vehicle, played: Scene = T) -> Iterator[Simulation]:
+def street(*vehicles: Vehicle, played: Scene = T) -> Iterator[SceneSimulation]:
     """Traffic without an ego; nobody else comes."""
-    simulation = Simulation(1, played, with_ego=False)
+    simulation = SceneSimulation(1, played, with_ego=False)
     members = {profile: index for index, profile in enumerate(one.profile for one in simulation.population)}
     placed = [PlacedVehicle(route, STOP_LINE_M[route] - far_m, members[who]) for route, who, far_m in vehicles]
     try:

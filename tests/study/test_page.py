@@ -23,7 +23,7 @@ from tint_sumo.methods.evaluation import Case, Evaluation
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.registry import METHODS
 from tint_sumo.scenes import SCENES, find_scene
-from tint_sumo.scenes.geometry import POSE
+from tint_sumo.scenes.geometry import new_boxes
 from tint_sumo.scenes.layout import layout
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.jobs import read_curves
@@ -89,19 +89,19 @@ def test_the_middle_mix_that_most_policies_met_is_shown_with_first_seeds() -> No
 
 def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -> Moment:
     """One with two slots and two routes; the first slot's vehicle stands at ``x_m``."""
-    poses = np.zeros(2, POSE)
-    poses[0] = (x_m, -2.5, 0.0, 1.0)
-    poses[1] = (8.0, 1.25, -1.0, 0.0)
+    boxes = new_boxes(2, 5.0, 2.0)
+    boxes[0] = (x_m, -2.5, 0.0, 1.0, 5.0, 2.0)
+    boxes[1] = (8.0, 1.25, -1.0, 0.0, 5.0, 2.0)
     told = np.array([[2.0], [0.0]])
     common = Moment(
         time_s=0.1,
-        ego=poses[1],
+        ego=boxes[1],
         ego_mps=1.5,
         ego_brakes=True,
         is_held=False,
         present=np.array([number >= 0 for number in vehicles]),
         vehicles=np.array(vehicles),
-        poses=poses,
+        boxes=boxes,
         brakes=np.array([False, True]),
         traits=np.array([0, 1]),
         told=told,

@@ -31,7 +31,7 @@ from tint_sumo.dataset.windows import Windows
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.scenes import T_INTERSECTION, find_scene
-from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation.scene import SceneSimulation
 from tint_sumo.simulation.sumo import SUMO_COLLISION_CHECK
 from tint_sumo.simulation.timing import StepPart
 from tint_sumo.traits import TRAIT_METHODS
@@ -192,9 +192,9 @@ class _Driven:
         return batch
 
     @property
-    def simulation(self) -> Simulation:
+    def simulation(self) -> SceneSimulation:
         simulation = self.batch.episodes.simulation
-        assert isinstance(simulation, Simulation)
+        assert isinstance(simulation, SceneSimulation)
         return simulation
 
     def turn(self) -> int:
@@ -251,7 +251,7 @@ def _scenes(sizes: Sizes) -> dict[str, Any]:
     }
 
 
-def _bare_steps_per_s(simulation: Simulation) -> float:
+def _bare_steps_per_s(simulation: SceneSimulation) -> float:
     """Steps of SUMO in a row; the simulation loses track of its vehicles and is of no more use."""
     step = simulation.link.connection.step
     start = time.perf_counter()
@@ -264,7 +264,7 @@ def _checking_steps_per_s(sizes: Sizes, seed: int) -> float:
     """The same of a simulation that SUMO checks for collisions, after as many steps of random egos."""
     rng = np.random.default_rng(seed)
     scene = find_scene(T_INTERSECTION)
-    simulation = Simulation(sizes.replicas, scene, collision_options=SUMO_COLLISION_CHECK)
+    simulation = SceneSimulation(sizes.replicas, scene, collision_options=SUMO_COLLISION_CHECK)
     try:
         over = np.ones(sizes.replicas, bool)
         for step in range(_WARM_UP_STEPS + sizes.turn_steps):

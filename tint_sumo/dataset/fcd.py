@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import whole_file
 from tint_sumo.core.reading import TABLE_BYTES, is_gzipped, require_file
-from tint_sumo.scenes.geometry import POSE, place
+from tint_sumo.scenes.geometry import new_boxes, place
 from tint_sumo.scenes.layout import Layout
 
 EPISODE_PERIOD_S = 60.0
@@ -107,16 +107,16 @@ def _fronts(
     front_m: NDArray[np.float64], route: NDArray[np.integer], layout: Layout
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """x and y of front bumpers, and the vehicles' angles, clockwise from north in degrees; all (M,)."""
-    length_m = layout.scene.vehicle.length_m
-    poses = np.zeros(len(front_m), POSE)
+    length_m, width_m = layout.scene.vehicle.length_m, layout.scene.vehicle.width_m
+    boxes = new_boxes(len(front_m), length_m, width_m)
     for number, way in enumerate(layout.ways):
         here = route == number
-        placed = np.zeros(int(here.sum()), POSE)
-        place(front_m[here], way, length_m, placed)
-        poses[here] = placed
-    x_m = poses["x_m"] + length_m / 2 * poses["heading_x"]
-    y_m = poses["y_m"] + length_m / 2 * poses["heading_y"]
-    return x_m, y_m, np.degrees(np.arctan2(poses["heading_x"], poses["heading_y"])) % 360.0
+        placed = boxes[here]
+        place(front_m[here], way, placed)
+        boxes[here] = placed
+    x_m = boxes["x_m"] + length_m / 2 * boxes["heading_x"]
+    y_m = boxes["y_m"] + length_m / 2 * boxes["heading_y"]
+    return x_m, y_m, np.degrees(np.arctan2(boxes["heading_x"], boxes["heading_y"])) % 360.0
 
 
 def _decimals(values: NDArray[np.float64]) -> NDArray[np.object_]:

@@ -26,7 +26,7 @@ from tint_sumo.jobs import Workers
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
 from tint_sumo.scenes.geometry import Floats, Numbers
 from tint_sumo.scenes.layout import layout
-from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation.scene import SceneSimulation
 
 EPISODES_PER_SHARD = 16
 
@@ -121,19 +121,19 @@ class _Shards:
         return shard_contents(self.out, number)
 
 
-_simulations: dict[Scene, Simulation] = {}  # this process's, one at most: libsumo runs no more
+_simulations: dict[Scene, SceneSimulation] = {}  # this process's, one at most: libsumo runs no more
 
 
-def _simulation(scene: Scene) -> Simulation:
+def _simulation(scene: Scene) -> SceneSimulation:
     """This process's simulation; starting one for every shard would cost more than recording it."""
     if scene not in _simulations:
         _simulations.clear()
-        _simulations[scene] = Simulation(EPISODES_PER_SHARD, scene, with_ego=False)
+        _simulations[scene] = SceneSimulation(EPISODES_PER_SHARD, scene, with_ego=False)
     return _simulations[scene]
 
 
 def simulate_episodes(
-    simulation: Simulation, seed: int, first_episode: int, steps: int = EPISODE_STEPS
+    simulation: SceneSimulation, seed: int, first_episode: int, steps: int = EPISODE_STEPS
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Run one episode in every replica; return rows of trajectories (by vehicle and time) and of drivers."""
     replicas = simulation.replicas
@@ -167,7 +167,7 @@ def simulate_episodes(
             "speed_mps": speed_mps[at],
             "acceleration_mps2": _accelerations_mps2(speed_mps, number, scene.step_s)[at],
             "leader": pd.arrays.IntegerArray(leader[at].astype(np.int16), leader[at] < 0),
-            "gap_m": gap_m[at],
+            "gap_m": np.where(leader[at] < 0, np.nan, gap_m[at]),
         }
     )
     first = ~trajectories.duplicated(["episode", "vehicle"]).to_numpy()
@@ -175,7 +175,7 @@ def simulate_episodes(
 
 
 def _driver_rows(
-    simulation: Simulation, keys: Mapping[str, NDArray[np.int64]], member: NDArray[np.int64]
+    simulation: SceneSimulation, keys: Mapping[str, NDArray[np.int64]], member: NDArray[np.int64]
 ) -> pd.DataFrame:
     drivers = [simulation.population[index] for index in member]
     return pd.DataFrame(

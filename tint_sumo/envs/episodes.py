@@ -42,7 +42,7 @@ from tint_sumo.envs.rows import (
 )
 from tint_sumo.scenes import T_INTERSECTION, Scene, SumocfgScene, find_scene
 from tint_sumo.scenes.geometry import Floats
-from tint_sumo.simulation.sumocfg import make_simulation
+from tint_sumo.simulation import make_simulation
 from tint_sumo.simulation.timing import StepPart, does
 
 _SEED_LIMIT = 2**63
@@ -246,10 +246,10 @@ class Episodes:
             noise = self._noise[index].normal(0.0, self.settings.position_noise_m, self._noise_m.shape[1:])
             self._noise_m[index] = noise
         observe(
-            egos.pose[envs],
+            egos.box[envs],
             egos.speed_mps[envs],
             slots.present[envs],
-            slots.pose[envs],
+            slots.box[envs],
             self._trait_of_member[slots.member[envs]],
             self._noise_m[envs],
             self.steps[envs],
@@ -267,7 +267,7 @@ class Episodes:
             self.simulation.passed_m,
             slots.present[envs],
             slots.route[envs],
-            slots.pose[envs],
+            slots.box[envs],
             slots.front_m[envs],
             leader,
             gap_m,
@@ -280,5 +280,5 @@ class Episodes:
         event = self.simulation.egos.collision[index]
         if event is None or self.rows["outcome"][index] != COLLISION:
             return {}
-        trait = self.simulation.traits[self.simulation.trait_of_member[event.member]]
+        trait = self.simulation.scene.traits[self.simulation.trait_of_member[event.member]]
         return {"trait": trait, "route": event.route, "slot": event.slot, "ego_m": (event.ego_x_m, event.ego_y_m)}

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import RewardPreset
 from tint_sumo.core.compiling import compiled
-from tint_sumo.scenes.geometry import Bools, Floats, Numbers, Poses
+from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.scene import Scene
 from tint_sumo.scenes.sumocfg import SumocfgScene
 
@@ -179,10 +179,10 @@ def _bounded(value: float) -> float:
 
 @compiled
 def observe(
-    egos: Poses,
+    egos: Boxes,
     speed_mps: Floats,
     present: Bools,
-    vehicles: Poses,
+    vehicles: Boxes,
     traits: NDArray[np.int8],
     noise_m: Floats,
     steps: Numbers,
@@ -222,7 +222,7 @@ def observe_tracks(
     passed_m: Floats,
     present: Bools,
     route: Numbers,
-    vehicles: Poses,
+    vehicles: Boxes,
     front_m: Floats,
     leader: Numbers,
     gap_m: Floats,

@@ -17,8 +17,7 @@ from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, requi
 from tint_sumo.envs.rows import OBSERVATION_KEYS, Observation, fields_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
 from tint_sumo.scenes import T_INTERSECTION, Scene, SumocfgScene
-from tint_sumo.simulation.simulation import Simulation
-from tint_sumo.simulation.sumocfg import SumocfgSimulation
+from tint_sumo.simulation import Simulation
 
 
 class SceneEnv(gymnasium.Env[Any, Any]):
@@ -211,7 +210,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._episodes.step(actions)
 
     @property
-    def simulation(self) -> Simulation | SumocfgSimulation:
+    def simulation(self) -> Simulation:
         """What is simulated, to be looked at only; the environment is its replica 0."""
         return self._episodes.simulation
 

@@ -14,8 +14,8 @@ from tint_sumo.methods.loading import Contender
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.trait_sources import Frame, OracleTraits, TraitSource, one_hot
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
-from tint_sumo.scenes.geometry import Bools, Floats, Numbers, Poses
-from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers
+from tint_sumo.simulation.scene import SceneSimulation
 
 _BRAKING_MPS2 = 0.5  # vehicles that slow down by more than this show it
 
@@ -25,13 +25,13 @@ class Moment:
     """What there is to see after a step of the simulation; V vehicle slots, K routes of the traffic."""
 
     time_s: float
-    ego: np.void  # pose of the ego
+    ego: np.void  # box of the ego
     ego_mps: float
     ego_brakes: bool
     is_held: bool  # the ego's safety check overrides the policy
     present: Bools  # (V,)
     vehicles: Numbers  # (V,) running numbers of the vehicles in the episode, -1 in empty slots
-    poses: Poses  # (V,)
+    boxes: Boxes  # (V,)
     brakes: Bools  # (V,)
     traits: Numbers  # (V,) true ones: numbers of profiles, -1 in empty slots
     told: Floats | None  # (V, Z) traits as the policy is told them
@@ -84,8 +84,8 @@ class _Stage:
         tracks = source is not None and source.needs_tracks
         self.env = SceneEnv(contender.scene, tracks=tracks, **task)
         self.source = source
-        assert isinstance(self.env.simulation, Simulation)  # policies drive in built-in scenes
-        self.simulation: Simulation = self.env.simulation
+        assert isinstance(self.env.simulation, SceneSimulation)  # policies drive in built-in scenes
+        self.simulation: SceneSimulation = self.env.simulation
         if source is not None:
             source.attach(1, self.simulation.scene.max_vehicles)
 
@@ -115,7 +115,7 @@ class _Stage:
 class _Speeds:
     """Who brakes, from where all are at each step."""
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: SceneSimulation) -> None:
         self._simulation = simulation
         self._step_s = simulation.scene.step_s
         self._who = np.full(simulation.scene.max_vehicles, -1)
@@ -164,18 +164,18 @@ def _moment(stage: _Stage, driver: _Driver, speeds: _Speeds, desired_mps: float 
     brakes, ego_brakes = speeds.brakes()
     return Moment(
         time_s=stage.info["time_s"],
-        ego=egos.pose[0].copy(),
+        ego=egos.box[0].copy(),
         ego_mps=float(egos.speed_mps[0]),
         ego_brakes=ego_brakes,
         is_held=bool(egos.unsafe[0]),
         present=slots.present[0].copy(),
         vehicles=slots.vehicle_number[0].copy(),
-        poses=slots.pose[0].copy(),
+        boxes=slots.box[0].copy(),
         brakes=brakes,
         traits=stage.info["traits"].astype(np.int64),
         told=observation[TRAITS][0].astype(np.float64) if TRAITS in observation else None,
         attention=driver.attention(observation),
-        claimed=egos.has_claimed[0].copy(),
+        claimed=stage.simulation.yielding.has_claimed[0].copy(),
         desired_mps=desired_mps,
         value=value,
         outcome=stage.info["outcome"],

@@ -56,12 +56,12 @@ class Artist:
         slots = np.flatnonzero(moment.present).tolist()
         if moment.attention is not None:
             for slot in slots:
-                _draw_halo(canvas, moment.poses[slot], float(moment.attention[slot]))
+                _draw_halo(canvas, moment.boxes[slot], float(moment.attention[slot]))
         fills = self._fills(moment)
         for slot in slots:
             profile = self.layout.scene.population.profiles[moment.traits[slot]]
             outline = tuple(int(part) for part in profile.colour.split(","))
-            self._draw_vehicle(canvas, moment.poses[slot], outline, fills[slot], bool(moment.brakes[slot]))
+            self._draw_vehicle(canvas, moment.boxes[slot], outline, fills[slot], bool(moment.brakes[slot]))
         self._draw_vehicle(canvas, moment.ego, _INK, _EGO, moment.ego_brakes)
         return canvas.drawing.reduce(_OVERSAMPLING)
 
@@ -80,10 +80,10 @@ class Artist:
         back_m, side_m = -shape.length_m / 2, shape.width_m / 2
         for inset_m, colour in ((0.0, outline), (_OUTLINE_M, _WHITE), (_OUTLINE_M + _RING_M, fill)):
             half_length_m, half_width_m = -back_m - inset_m, side_m - inset_m
-            corners = canvas.box(pose, (-half_length_m, half_length_m), (-half_width_m, half_width_m))
+            corners = canvas.part(pose, (-half_length_m, half_length_m), (-half_width_m, half_width_m))
             canvas.draw.polygon(corners, fill=colour)
         glass_m = (0.16 * shape.length_m, 0.3 * shape.length_m)
-        canvas.draw.polygon(canvas.box(pose, glass_m, (-half_width_m, half_width_m)), fill=_GLASS)
+        canvas.draw.polygon(canvas.part(pose, glass_m, (-half_width_m, half_width_m)), fill=_GLASS)
         if brakes:
             _draw_lamp(canvas, pose, back_m, (-side_m, -side_m + 2 * _LAMP_M))
             _draw_lamp(canvas, pose, back_m, (side_m - 2 * _LAMP_M, side_m))
@@ -155,9 +155,9 @@ def _key(
 def _draw_lamp(canvas: Canvas, pose: np.void, back_m: float, across_m: tuple[float, float]) -> None:
     """A brake light behind a vehicle."""
     right_m, left_m = across_m
-    canvas.draw.polygon(canvas.box(pose, (back_m - _LAMP_M - _EDGE_M, back_m + _EDGE_M), across_m), fill=_WHITE)
+    canvas.draw.polygon(canvas.part(pose, (back_m - _LAMP_M - _EDGE_M, back_m + _EDGE_M), across_m), fill=_WHITE)
     inside_m = (right_m + _EDGE_M, left_m - _EDGE_M)
-    canvas.draw.polygon(canvas.box(pose, (back_m - _LAMP_M, back_m), inside_m), fill=_LAMP)
+    canvas.draw.polygon(canvas.part(pose, (back_m - _LAMP_M, back_m), inside_m), fill=_LAMP)
 
 
 def _draw_halo(canvas: Canvas, pose: np.void, weight: float) -> None:
@@ -201,7 +201,7 @@ def _view(layout: Layout) -> View:
 @cache
 def _roads(layout: Layout) -> Image.Image:
     """The empty roads with the ego's way; not to be drawn on."""
-    roads = background(layout, _view(layout), SIZE_PX[0], _OVERSAMPLING).copy()
+    roads = background(layout.roads, _view(layout), SIZE_PX[0], _OVERSAMPLING).copy()
     canvas = Canvas(_view(layout), roads, width_px=SIZE_PX[0], oversampling=_OVERSAMPLING)
     task = layout.scene.ego
     way = _between(layout.ego.way, task.start_m, task.goal_m)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tint_sumo.config import POSITION_SCALE_M, SPEED_SCALE_MPS
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, SumocfgScene, find_scene
-from tint_sumo.scenes.geometry import POSE, SPACING_M, Floats, along, as_line, place, project
+from tint_sumo.scenes.geometry import SPACING_M, Floats, along, as_line, new_boxes, place, project
 from tint_sumo.scenes.layout import Layout, layout
 
 Observation = dict[str, NDArray[np.float32]]
@@ -117,9 +117,10 @@ class _World:
             [project(point[None], one)[0][0] for point, one in zip(inside, self._lines, strict=True)]
         )
         self._ego_fronts_m = along(way)
-        poses = np.zeros(len(way), POSE)
-        place(self._ego_fronts_m, way, layout.scene.vehicle.length_m, poses)
-        centres = np.stack([poses["x_m"], poses["y_m"]], axis=-1)
+        vehicle = layout.scene.vehicle
+        egos = new_boxes(len(way), vehicle.length_m, vehicle.width_m)
+        place(self._ego_fronts_m, way, egos)
+        centres = np.stack([egos["x_m"], egos["y_m"]], axis=-1)
         self._ego_line = as_line(centres)
         self._ego_centres_m = np.r_[0.0, np.cumsum(np.hypot(*np.diff(centres, axis=0).T))]
 

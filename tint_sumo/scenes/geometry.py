@@ -1,4 +1,4 @@
-"""Where things are: ways by arc length, the poses of the boxes that drive along them, and distances between boxes.
+"""Ways by arc length, the boxes of vehicles that drive along them, and distances between boxes.
 
 A way is the trace of a front bumper, as points at every ``SPACING_M`` of its arc length. SUMO leads the front along the
 lanes' shapes, and the back along the same shapes a vehicle's length behind; so it is here.
@@ -19,9 +19,20 @@ Numbers = NDArray[np.int64]
 
 SPACING_M = 0.02  # a chord of a circle of 6 m lies within 0.01 mm of it
 
-# A box's centre and unit heading.
-POSE = np.dtype((np.record, [(part, np.float64) for part in ("x_m", "y_m", "heading_x", "heading_y")]))
-Poses = NDArray[np.void]  # records of POSE
+# A vehicle's box: centre, unit heading and size.
+BOX = np.dtype(
+    (np.record, [(part, np.float64) for part in ("x_m", "y_m", "heading_x", "heading_y", "length_m", "width_m")])
+)
+Boxes = NDArray[np.void]  # records of BOX
+
+NO_VEHICLE = -1  # slot of the leader of a vehicle that has none, and whatever else an empty slot has a number for
+
+
+def new_boxes(count: int, length_m: float, width_m: float) -> Boxes:
+    """Return boxes (count,) of one size that are nowhere yet."""
+    boxes = np.zeros(count, BOX)
+    boxes["length_m"], boxes["width_m"] = length_m, width_m
+    return boxes
 
 
 def resample(points: Floats, length_m: float) -> Floats:
@@ -64,22 +75,22 @@ def way_point(way: Floats, along_m: float) -> tuple[float, float]:
 
 
 @compiled
-def place_one(front_m: float, way: Floats, length_m: float, pose: Any) -> None:
-    """Write the pose, one record, of a box whose front has come so far along its way."""
+def place_one(front_m: float, way: Floats, box: Any) -> None:
+    """Write centre and heading of a box, one record, whose front has come so far along its way."""
     front_x_m, front_y_m = way_point(way, front_m)
-    back_x_m, back_y_m = way_point(way, front_m - length_m)
+    back_x_m, back_y_m = way_point(way, front_m - box.length_m)
     along_x_m, along_y_m = front_x_m - back_x_m, front_y_m - back_y_m
     norm_m = math.hypot(along_x_m, along_y_m)
-    pose.heading_x, pose.heading_y = along_x_m / norm_m, along_y_m / norm_m
-    pose.x_m = front_x_m - length_m / 2 * pose.heading_x
-    pose.y_m = front_y_m - length_m / 2 * pose.heading_y
+    box.heading_x, box.heading_y = along_x_m / norm_m, along_y_m / norm_m
+    box.x_m = front_x_m - box.length_m / 2 * box.heading_x
+    box.y_m = front_y_m - box.length_m / 2 * box.heading_y
 
 
 @compiled
-def place(front_m: Floats, way: Floats, length_m: float, poses: Poses) -> None:
-    """Write the poses (N,) of boxes whose fronts (N,) have come so far along one way."""
+def place(front_m: Floats, way: Floats, boxes: Boxes) -> None:
+    """Write centres and headings of boxes (N,) whose fronts (N,) have come so far along one way."""
     for index in range(len(front_m)):
-        place_one(front_m[index], way, length_m, poses[index])
+        place_one(front_m[index], way, boxes[index])
 
 
 @compiled
@@ -89,22 +100,20 @@ def follow(
     route: Numbers,
     lane_start_m: Floats,
     ways: Floats,
-    length_m: float,
     stage: Numbers,
     was_pos_m: Floats,
     front_m: Floats,
-    poses: Poses,
+    boxes: Boxes,
 ) -> None:
-    """Follow vehicles to where SUMO has them.
+    """Move vehicles to where SUMO has them.
 
     Args:
         index: (N,) of vehicles in the arrays (S,) of all slots: ``route``, and those written to.
         lane_pos_m: (N,) of their fronts on their SUMO lanes.
         lane_start_m: (K, S) where each lane of a route starts.
         ways: (K, P, 2) of the routes.
-        length_m: of every vehicle.
         stage, was_pos_m: number of the SUMO lane on the route, and position on it; read and written.
-        front_m, poses: written.
+        front_m, boxes: written.
     """
     for one in range(len(index)):
         slot, position_m = index[one], lane_pos_m[one]
@@ -113,7 +122,7 @@ def follow(
             stage[slot] += 1
         was_pos_m[slot] = position_m
         front_m[slot] = lane_start_m[route[slot], stage[slot]] + position_m
-        place_one(front_m[slot], ways[route[slot]], length_m, poses[slot])
+        place_one(front_m[slot], ways[route[slot]], boxes[slot])
 
 
 @compiled
@@ -122,42 +131,41 @@ def find_leaders(
     route: Numbers,
     stage: Numbers,
     front_m: Floats,
+    boxes: Boxes,
     lane_start_m: Floats,
     lane_on_route_m: Floats,
-    length_m: float,
     leader: Numbers,
     gap_m: Floats,
 ) -> None:
-    """Write the slot of the next vehicle ahead on each vehicle's route, -1 if none, and the gap to it, NaN if none.
+    """Write the slot of the next vehicle ahead on each vehicle's route, and the gap to it, infinite without one.
 
     Args:
-        present, route, stage, front_m: (R, V) of the vehicles.
+        present, route, stage, front_m, boxes: (R, V) of the vehicles.
         lane_start_m: (K, S) where each lane of a route starts.
         lane_on_route_m: (K, K, S) where on the first route each lane of the second one starts; NaN if it does not.
-        length_m: of every vehicle.
         leader, gap_m: (R, V) written; the gap is bumper to bumper.
     """
-    here = np.empty(present.shape[1], np.int64)  # slots of a row that hold a vehicle
+    occupied = np.empty(present.shape[1], np.int64)  # slots of a row that hold a vehicle
     for row in range(present.shape[0]):
         count = 0
         for slot in range(present.shape[1]):
-            leader[row, slot] = -1
-            gap_m[row, slot] = math.nan
+            leader[row, slot] = NO_VEHICLE
+            gap_m[row, slot] = math.inf
             if present[row, slot]:
-                here[count] = slot
+                occupied[count] = slot
                 count += 1
-        for slot in here[:count]:
-            own, nearest_m = route[row, slot], math.inf
-            for other in here[:count]:
+        for slot in occupied[:count]:
+            this, nearest_m = route[row, slot], math.inf
+            for other in occupied[:count]:
                 theirs, ahead_m = route[row, other], front_m[row, other] - front_m[row, slot]
-                if theirs != own:
+                if theirs != this:
                     lane = stage[row, other]
-                    ahead_m += lane_on_route_m[own, theirs, lane] - lane_start_m[theirs, lane]
+                    ahead_m += lane_on_route_m[this, theirs, lane] - lane_start_m[theirs, lane]
                 if 0.0 < ahead_m < nearest_m:  # neither the vehicle itself nor NaN
                     nearest_m = ahead_m
                     leader[row, slot] = other
             if leader[row, slot] >= 0:
-                gap_m[row, slot] = nearest_m - length_m
+                gap_m[row, slot] = nearest_m - boxes[row, leader[row, slot]].length_m
 
 
 @compiled
@@ -183,11 +191,11 @@ def box_distance_m(
     apart = False
     # Two views: the box along x as the turned one has it ahead and abreast, and the turned one as that one has it. Each
     # box is turned by the same angle in the other's view, to one side and to the other.
-    for ahead_m, abreast_m, turn, seen_length_m, seen_width_m, own_length_m, own_width_m in (
+    for ahead_m, abreast_m, turn, seen_length_m, seen_width_m, from_length_m, from_width_m in (
         (dx_m * cos + dy_m * sin, dy_m * cos - dx_m * sin, -sin, length_m, width_m, turned_length_m, turned_width_m),
         (dx_m, dy_m, sin, turned_length_m, turned_width_m, length_m, width_m),
     ):
-        half_length_m, half_width_m = own_length_m / 2, own_width_m / 2
+        half_length_m, half_width_m = from_length_m / 2, from_width_m / 2
         low_ahead_m, high_ahead_m, low_abreast_m, high_abreast_m = math.inf, -math.inf, math.inf, -math.inf
         for along_m in (seen_length_m / 2, -seen_length_m / 2):
             for across_m in (seen_width_m / 2, -seen_width_m / 2):
@@ -207,74 +215,34 @@ def box_distance_m(
 
 
 @compiled
-def pose_distance_m(
-    ego: Any, other: Any, length_m: float, width_m: float, other_length_m: float, other_width_m: float
-) -> float:
-    """Shortest distance between the boxes of an ego and another vehicle, both poses; 0 where they overlap."""
-    dx_m, dy_m = other.x_m - ego.x_m, other.y_m - ego.y_m
+def clearance_m(box: Any, other: Any) -> float:
+    """Return the shortest distance between two boxes; 0 where they overlap."""
+    dx_m, dy_m = other.x_m - box.x_m, other.y_m - box.y_m
     # seen from a frame that heads like the other
     ahead_m = dx_m * other.heading_x + dy_m * other.heading_y
     abreast_m = dy_m * other.heading_x - dx_m * other.heading_y
-    cos = ego.heading_x * other.heading_x + ego.heading_y * other.heading_y
-    sin = ego.heading_y * other.heading_x - ego.heading_x * other.heading_y
-    return box_distance_m(ahead_m, abreast_m, cos, sin, other_length_m, other_width_m, length_m, width_m)
+    cos = box.heading_x * other.heading_x + box.heading_y * other.heading_y
+    sin = box.heading_y * other.heading_x - box.heading_x * other.heading_y
+    return box_distance_m(ahead_m, abreast_m, cos, sin, other.length_m, other.width_m, box.length_m, box.width_m)
 
 
 @compiled
-def measure_distances_m(
-    egos: Poses,
-    present: Bools,
-    vehicles: Poses,
-    reach_m: float,
-    length_m: float,
-    width_m: float,
-    distance_m: Floats,
-) -> None:
+def measure_distances_m(egos: Boxes, present: Bools, vehicles: Boxes, reach_m: float, distance_m: Floats) -> None:
     """Write the distances from each ego's box to the vehicles' boxes.
 
     Args:
         egos: (R,).
-        present, vehicles: (R, V) which slots hold a vehicle, and its pose.
+        present, vehicles: (R, V) which slots hold a vehicle, and its box.
         reach_m: distances beyond it may be written as infinite.
-        length_m, width_m: of every box.
         distance_m: (R, V) written; infinite for empty slots.
     """
-    radius_m = math.hypot(length_m, width_m) / 2  # the circle around a box
     for row in range(len(egos)):
         ego = egos[row]
+        ego_radius_m = math.hypot(ego.length_m, ego.width_m) / 2  # the circle around the box
         for slot in range(present.shape[1]):
-            other = vehicles[row, slot]
-            dx_m, dy_m = other.x_m - ego.x_m, other.y_m - ego.y_m
-            near = present[row, slot] and abs(dx_m) < reach_m + 2 * radius_m and abs(dy_m) < reach_m + 2 * radius_m
-            if near:
-                distance_m[row, slot] = pose_distance_m(ego, other, length_m, width_m, length_m, width_m)
-            else:
-                distance_m[row, slot] = math.inf
-
-
-@compiled
-def measure_unlike_distances_m(
-    ego: Any,
-    present: Bools,
-    vehicles: Poses,
-    length_m: float,
-    width_m: float,
-    vehicle_length_m: Floats,
-    vehicle_width_m: Floats,
-    distance_m: Floats,
-) -> None:
-    """Write the distances from one ego's box to the boxes of vehicles that each have a size of their own.
-
-    Args:
-        ego: its pose.
-        present, vehicles: (V,) which slots hold a vehicle, and its pose.
-        length_m, width_m: of the ego.
-        vehicle_length_m, vehicle_width_m: (V,).
-        distance_m: (V,) written; infinite for empty slots.
-    """
-    for slot in range(len(present)):
-        distance_m[slot] = math.inf
-        if present[slot]:
-            distance_m[slot] = pose_distance_m(
-                ego, vehicles[slot], length_m, width_m, vehicle_length_m[slot], vehicle_width_m[slot]
-            )
+            distance_m[row, slot] = math.inf
+            if present[row, slot]:
+                other = vehicles[row, slot]
+                near_m = reach_m + ego_radius_m + math.hypot(other.length_m, other.width_m) / 2
+                if abs(other.x_m - ego.x_m) < near_m and abs(other.y_m - ego.y_m) < near_m:
+                    distance_m[row, slot] = clearance_m(ego, other)

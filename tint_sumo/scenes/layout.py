@@ -19,10 +19,11 @@ import sumolib
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from tint_sumo.config import Population, Traffic, VehicleShape
+from tint_sumo.config import Population, Traffic
 from tint_sumo.core.errors import InputError
-from tint_sumo.scenes.geometry import POSE, SPACING_M, Floats, Poses, along, place, resample
+from tint_sumo.scenes.geometry import SPACING_M, Boxes, Floats, along, new_boxes, place, resample
 from tint_sumo.scenes.network import Point, build_network, name, plain_xml
+from tint_sumo.scenes.roads import Roads, border_marks, paved_areas
 from tint_sumo.scenes.scene import Scene
 
 _SWEEP_SPACING_M = 0.05  # between the poses of the ego whose boxes make up its swept area
@@ -77,7 +78,7 @@ class Layout:
         Floats  # (K, K, S): where on the first route each lane of the second one starts; NaN if it does not
     )
     ways: Floats  # (K, P, 2)
-    roads: BaseGeometry  # the paved area, for pictures
+    roads: Roads
 
 
 @cache
@@ -107,7 +108,7 @@ def _layout(scene: Scene) -> Layout:
         lane_start_m=_padded([path.lane_start_m for path in routes]),
         lane_on_route_m=_shared_lanes(routes),
         ways=np.stack([resample(path.way, (points - 2) * SPACING_M)[:points] for path in routes]),
-        roads=_roads(net),
+        roads=_roads(net, scene, routes),
     )
 
 
@@ -119,13 +120,12 @@ def _read(scene: Scene) -> Any:
         return sumolib.net.readNet(str(file), withInternal=True)
 
 
-def _roads(net: Any) -> BaseGeometry:
-    """The area of all lanes and junctions."""
-    lanes = [lane for edge in net.getEdges(withInternal=False) for lane in edge.getLanes()]
-    paved = [shapely.LineString(lane.getShape()).buffer(lane.getWidth() / 2, cap_style="flat") for lane in lanes]
-    outlines = [node.getShape() for node in net.getNodes() if len(node.getShape()) > 2]
-    paved += [shapely.Polygon(outline).buffer(_SEAM_M) for outline in outlines]
-    return shapely.union_all(paved)
+def _roads(net: Any, scene: Scene, routes: Sequence[Path]) -> Roads:
+    """Return the area of all lanes and junctions, in one piece, and the marks along the routes."""
+    paved = shapely.union_all(paved_areas(net, seam_m=_SEAM_M))
+    ways = [path.way[: round(path.length_m / SPACING_M)] for path in routes]
+    marks = [mark for way in ways for mark in border_marks(way, scene.network.lane_width_m)]
+    return Roads(shapely.STRtree([paved]), shapely.STRtree(marks))
 
 
 def _path(net: Any, route: str, edges: tuple[str, ...], scene: Scene, way: tuple[Point, ...]) -> Path:
@@ -184,11 +184,11 @@ def _shared_lanes(routes: Sequence[Path]) -> Floats:
 def _zones(scene: Scene, routes: Sequence[Path], way: Floats) -> ConflictZones:
     """Look along the ego's way at each route."""
     fronts_m = along(way)
-    poses = np.zeros(len(way), POSE)
-    place(fronts_m, way, scene.vehicle.length_m, poses)
-    centres = np.stack([poses["x_m"], poses["y_m"]], axis=-1)
+    egos = new_boxes(len(way), scene.vehicle.length_m, scene.vehicle.width_m)
+    place(fronts_m, way, egos)
+    centres = np.stack([egos["x_m"], egos["y_m"]], axis=-1)
     ahead = fronts_m >= scene.ego.start_m
-    boxes = _boxes(poses, scene.vehicle)
+    boxes = _polygons(egos)
     swept = _swept_area(scene, way)
     half_m = scene.network.lane_width_m / 2
     enter_m, inside_m, passed_m, stop_line_m, towards = [], [], [], [], []
@@ -224,19 +224,19 @@ def _swept_area(scene: Scene, way: Floats) -> BaseGeometry:
     vehicle = scene.vehicle
     end_m = min(scene.ego.goal_m + vehicle.length_m, (len(way) - 2) * SPACING_M)
     fronts_m: Floats = np.arange(scene.ego.start_m, end_m, _SWEEP_SPACING_M)
-    poses = np.zeros(len(fronts_m), POSE)
-    place(fronts_m, way, vehicle.length_m, poses)
+    egos = new_boxes(len(fronts_m), vehicle.length_m, vehicle.width_m)
+    place(fronts_m, way, egos)
     margin_m = scene.ego.controller.unsafe_distance_m + _STOP_MARGIN_M
-    swept = shapely.buffer(shapely.union_all(_boxes(poses, vehicle)), margin_m)
+    swept = shapely.buffer(shapely.union_all(_polygons(egos)), margin_m)
     shapely.prepare(swept)
     return swept
 
 
-def _boxes(poses: Poses, vehicle: VehicleShape) -> NDArray[Any]:
-    """Polygons (N,) of boxes at these poses (N,)."""
-    ahead = np.stack([poses["heading_x"], poses["heading_y"]], axis=-1) * (vehicle.length_m / 2)
-    abreast = np.stack([-poses["heading_y"], poses["heading_x"]], axis=-1) * (vehicle.width_m / 2)
-    centre = np.stack([poses["x_m"], poses["y_m"]], axis=-1)
+def _polygons(boxes: Boxes) -> NDArray[Any]:
+    """Return boxes (N,) as polygons (N,)."""
+    ahead = np.stack([boxes["heading_x"], boxes["heading_y"]], axis=-1) * (boxes["length_m"] / 2)[:, None]
+    abreast = np.stack([-boxes["heading_y"], boxes["heading_x"]], axis=-1) * (boxes["width_m"] / 2)[:, None]
+    centre = np.stack([boxes["x_m"], boxes["y_m"]], axis=-1)
     corners = [centre + ahead + abreast, centre + ahead - abreast, centre - ahead - abreast, centre - ahead + abreast]
     return np.asarray(shapely.polygons(np.stack(corners, axis=1)))
 

@@ -58,6 +58,10 @@ class View:
     right_m: float
     top_m: float
 
+    def moved(self, x_m: float, y_m: float) -> "View":
+        """Return the view from a frame whose origin is at the other end of this vector."""
+        return View(self.left_m + x_m, self.bottom_m + y_m, self.right_m + x_m, self.top_m + y_m)
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -100,9 +104,24 @@ class Scene:
             raise InputError(f"tau_s must be at least a step of {self.step_s:g} s, and finite, not {self.tau_s}")
 
     @property
+    def traits(self) -> tuple[str, ...]:
+        """Names of the drivers' traits; labels are their numbers."""
+        return tuple(profile.name for profile in self.population.profiles)
+
+    @property
+    def trait_colours(self) -> tuple[tuple[int, ...], ...]:
+        """Red, green and blue of each trait in pictures."""
+        return tuple(tuple(map(int, profile.colour.split(","))) for profile in self.population.profiles)
+
+    @property
     def tau_s(self) -> float:
         """Time headway of the drivers."""
         return self.population.idm.tau_s
+
+    @property
+    def speed_limit_mps(self) -> float:
+        """Speed that no vehicle exceeds."""
+        return self.network.speed_limit_mps
 
     @property
     def digest(self) -> str:

@@ -9,24 +9,29 @@ import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 from xml.etree import ElementTree
 from xml.sax import SAXException
 
+import shapely
 import sumolib
 
-from tint_sumo.config import Claim, DistanceM, EgoController, Slots, TimeS, VehicleShape, WarmUpS
+from tint_sumo.config import DistanceM, EgoController, Slots, TimeS, VehicleShape, WarmUpS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import require_ranges
 from tint_sumo.core.reading import TABLE_BYTES, require_file
+from tint_sumo.scenes.roads import Roads, paved_areas
 from tint_sumo.scenes.scene import EgoTask
 
 NET_VERSION = (1, 20)  # the version that this SUMO's netconvert writes into networks
 MOST_VTYPES = 127  # labels are numbers of one byte
 DEFAULT_VTYPE = "DEFAULT_VEHTYPE"  # SUMO's type for vehicles that name none
 _EGO_CLASS = "passenger"
+_COLOURS = ((40, 90, 200), (200, 40, 40), (30, 140, 70), (130, 60, 170), (220, 110, 20), (20, 150, 170), (90, 90, 90))
+_SEAM_M = 0.06  # half of the line between two lanes
 _DEFAULT_STEP_S = 1.0  # SUMO's
 # Each of these options and SUMO's other names for it.
 _NET, _ROUTES = ("net-file", "net", "n"), ("route-files", "routes", "r")
@@ -71,7 +76,8 @@ class SumocfgScene:
     up to ``sight_m`` away, the nearest ``max_vehicles`` of them.
     """
 
-    claim: ClassVar[Claim] = Claim()  # not used: SUMO's own rules decide who yields
+    tau_s: ClassVar[None] = None  # the vTypes say it
+    speed_limit_mps: ClassVar[float] = math.inf  # not known
 
     name: str
     config: SumoConfig
@@ -89,6 +95,16 @@ class SumocfgScene:
 
     def __post_init__(self) -> None:
         require_ranges(self)
+
+    @property
+    def traits(self) -> tuple[str, ...]:
+        """Names of the drivers' traits: their vTypes; labels are their numbers."""
+        return self.vtypes
+
+    @property
+    def trait_colours(self) -> tuple[tuple[int, ...], ...]:
+        """Red, green and blue of each vType in pictures; the colours begin again after some."""
+        return tuple(_COLOURS[number % len(_COLOURS)] for number in range(len(self.vtypes)))
 
     @property
     def step_s(self) -> float:
@@ -277,6 +293,13 @@ def read_net(file: Path, *, with_internal: bool = True) -> Any:
             "build it again with this one's netconvert"
         )
     return net
+
+
+@lru_cache(maxsize=4)
+def network_roads(net_file: Path) -> Roads:
+    """Return the roads of a network; thin lines part their lanes."""
+    net = read_net(net_file, with_internal=False)
+    return Roads(shapely.STRtree(paved_areas(net, seam_m=_SEAM_M, gap_m=_SEAM_M)), shapely.STRtree([]))
 
 
 def _measured(net: Any, edges: tuple[str, ...]) -> tuple[tuple[float, ...], list[tuple[float, float]], float]:

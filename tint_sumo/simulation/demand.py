@@ -1,4 +1,4 @@
-"""Who drives on the roads and where they appear: draws from each route's own generator."""
+"""The traffic of a scene: which drivers appear when and where, drawn from a generator for each route."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import numpy as np
 
 from tint_sumo.core.compiling import compiled
 from tint_sumo.scenes.drivers import DriverMember
-from tint_sumo.scenes.geometry import Bools, Floats, Numbers
+from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Floats, Numbers
 from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.slots import Slots
 
@@ -31,7 +31,7 @@ class Driver:
 
 
 class DriverPool:
-    """Whom all routes' streams draw from."""
+    """The drivers that all routes' streams draw from."""
 
     def __init__(self, population: tuple[DriverMember, ...], layout: Layout) -> None:
         self.population = population
@@ -67,7 +67,7 @@ class DriverStream:
         return Driver(member, gap_m, wait_s)
 
     def take(self) -> Driver:
-        """The upcoming driver, who is then followed by a new one."""
+        """Return the upcoming driver, and draw the next one."""
         driver, self.upcoming = self.upcoming, self._draw()
         return driver
 
@@ -83,7 +83,7 @@ class DriverStream:
 
 
 class Demand:
-    """Who comes next on each route of R replicas, and when there is room and time for it."""
+    """The next driver on each of the K routes of R replicas, and when there is room and time for it."""
 
     def __init__(self, replicas: int, population: tuple[DriverMember, ...], layout: Layout) -> None:
         shape = (replicas, len(layout.routes))
@@ -93,14 +93,15 @@ class Demand:
         self._wanted_gap_m: Floats = np.full(shape, np.inf)
         self._wanted_time_s: Floats = np.zeros(shape)
         self._admitted: Bools = np.zeros(shape, bool)
+        self._newest: Numbers = np.full(shape, NO_VEHICLE)  # slot of the vehicle that entered each route last
 
     @property
     def entry_m(self) -> float:
-        """Positions of newcomers' fronts."""
+        """Position of a newcomer's front on its route."""
         return self._layout.scene.vehicle.length_m
 
     def begin(self, replica: int, seed: np.random.SeedSequence) -> list[PlacedVehicle]:
-        """Start an episode; the vehicles that are on the roads already."""
+        """Start an episode; return the vehicles that are on the roads already."""
         p_conservative = np.random.default_rng(seed).uniform(*self._pool.scene.traffic.p_conservative_range)
         streams = tuple(
             DriverStream(np.random.default_rng(child), self._pool, p_conservative)
@@ -122,12 +123,22 @@ class Demand:
         self._wanted_gap_m[replica] = np.inf
         self._wanted_time_s[replica] = 0.0
         self._admitted[replica] = False
+        self._newest[replica] = NO_VEHICLE
+
+    def enter(self, replica: int, route: int, slot: int) -> None:
+        """Note that the vehicle in a slot is now the last on its route."""
+        self._newest[replica, route] = slot
+
+    def leave(self, replica: int, route: int, slot: int) -> None:
+        """Note that the vehicle in a slot has left its route."""
+        if self._newest[replica, route] == slot:
+            self._newest[replica, route] = NO_VEHICLE
 
     def admit(self, slots: Slots, time_s: Floats) -> Iterator[tuple[int, int]]:
-        """Replica and route of the drivers for whom there is room, and whose time has come; (R,) times."""
+        """Yield replica and route of the drivers for whom there is room, and whose time has come; (R,) times."""
         if admit(
             slots.front_m,
-            slots.newest,
+            self._newest,
             2 * self.entry_m,
             self._wanted_gap_m,
             time_s,
@@ -138,7 +149,7 @@ class Demand:
             yield from zip(rows.tolist(), routes.tolist(), strict=True)
 
     def take(self, replica: int, route: int, time_s: float) -> PlacedVehicle:
-        """The driver that enters a route now."""
+        """Return the driver that enters a route now."""
         driver = self._streams[replica][route].take()
         self._expect(replica, route, time_s)
         return PlacedVehicle(route, self.entry_m, driver.member)
@@ -159,18 +170,18 @@ def admit(
     wanted_time_s: Floats,
     admitted: Bools,
 ) -> bool:
-    """Tell for whom there is room, and whose time has come.
+    """Write for which routes' upcoming drivers there is room, and whose time has come.
 
     Args:
         front_m: (R, V) of vehicles along their routes.
-        newest: (R, K) slot of the vehicle that entered each route last; -1 for an open road.
-        taken_m: of that front's distance by its own vehicle and by the one that would enter.
+        newest: (R, K) slot of the vehicle that entered each route last; negative if it has left.
+        taken_m: length of two vehicles, the last one and the one that would enter.
         wanted_gap_m, wanted_time_s: (R, K) of the upcoming drivers; an infinite gap keeps a route closed.
         time_s: (R,).
         admitted: (R, K) written.
 
     Returns:
-        whether anybody is admitted.
+        whether any driver is admitted.
     """
     any_admitted = False
     for row in range(len(time_s)):

@@ -1,20 +1,18 @@
-"""The egos: the PD law on speed, the safety check, and their claims on the traffic's routes."""
+"""The egos: the PD law on speed, the safety check, and collisions."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from tint_sumo.core.compiling import compiled
-from tint_sumo.scenes.geometry import POSE, SPACING_M, Bools, Floats, Numbers, Poses, measure_distances_m, place
-from tint_sumo.scenes.layout import Layout
+from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers, measure_distances_m, new_boxes
 from tint_sumo.scenes.scene import Scene
 from tint_sumo.scenes.sumocfg import SumocfgScene
-from tint_sumo.simulation.slots import EMPTY, Slots
+from tint_sumo.simulation.slots import Slots
 from tint_sumo.simulation.timing import StepPart, does
-
-_STEP_MARGIN_M = 1.0  # more than a vehicle and the ego come closer in a step
 
 
 @dataclass(frozen=True)
@@ -23,13 +21,13 @@ class Collision:
 
     slot: int  # slot of the other vehicle
     member: int  # number of its driver in the population
-    route: str  # name of its route
+    route: str  # name of its route; in a SUMO configuration, the edge that it is on
     ego_x_m: float  # the ego's centre
     ego_y_m: float
 
 
 class EgoRules(NamedTuple):
-    """What the controller of a scene comes down to (see ``tint_sumo.config``)."""
+    """The numbers of a scene's controller (see ``tint_sumo.config.EgoController``) for compiled functions."""
 
     gain_per_s: float
     accel_limit_mps2: float
@@ -38,11 +36,8 @@ class EgoRules(NamedTuple):
     unsafe_distance_m: float
     closing_distance_m: float
     closing_speed_mps: float
-    approach_speed_mps: float
     watches_behind: bool
-    half_length_m: float  # half the length of the ego
     step_s: float
-    way_spacing_m: float
 
     @classmethod
     def of(cls, scene: Scene | SumocfgScene) -> "EgoRules":
@@ -55,11 +50,8 @@ class EgoRules(NamedTuple):
             controller.unsafe_distance_m,
             controller.closing_distance_m,
             controller.closing_speed_mps,
-            scene.claim.approach_speed_mps,
             controller.watches_behind,
-            scene.vehicle.length_m / 2,
             scene.step_s,
-            SPACING_M,
         )
 
 
@@ -69,106 +61,63 @@ class Egos:
     =============== ======= ======================================================================
     ``front_m``     (R,)    front bumper's distance along the ego's way
     ``speed_mps``   (R,)
-    ``pose``        (R,)    records of ``tint_sumo.scenes.geometry.POSE``
-    ``distance_m``  (R, V)  from its box to the vehicles' boxes; infinite if far, or where there is none
-    ``unsafe``      (R,)    what the safety check says for the next step
-    ``has_claimed`` (R, K)  which of the traffic's routes it claims
+    ``box``         (R,)    records of ``tint_sumo.scenes.geometry.BOX``
+    ``distance_m``  (R, V)  from its box to the vehicles' boxes; infinite if far, or in empty slots
+    ``unsafe``      (R,)    result of the safety check for the next step
     ``collision``   R items the first collision in the episode, or None
     =============== ======= ======================================================================
     """
 
-    def __init__(self, replicas: int, layout: Layout) -> None:
-        scene, routes = layout.scene, len(layout.routes)
-        self._layout = layout
+    def __init__(self, replicas: int, scene: Scene | SumocfgScene) -> None:
         self._rules = EgoRules.of(scene)
-        # The safety check needs to know how far away a vehicle was a step before.
-        self._reach_m = max(self._rules.closing_distance_m, self._rules.unsafe_distance_m) + _STEP_MARGIN_M
+        # The safety check needs the distance of a vehicle a step before it is near.
+        near_m = max(self._rules.closing_distance_m, self._rules.unsafe_distance_m)
+        fastest_mps = scene.speed_limit_mps + scene.ego.controller.desired_speeds_mps[-1]
+        self._reach_m = near_m + fastest_mps * scene.step_s
         self.front_m: Floats = np.zeros(replicas)
         self.speed_mps: Floats = np.zeros(replicas)
-        self.pose: Poses = np.zeros(replicas, POSE)
+        self.box: Boxes = new_boxes(replicas, scene.vehicle.length_m, scene.vehicle.width_m)
+        self._nowhere = self.box[:1].copy()
         self.distance_m: Floats = np.full((replicas, scene.max_vehicles), np.inf)
         self._was_distance_m: Floats = np.full((replicas, scene.max_vehicles), np.inf)  # distances one step ago
         self.unsafe: Bools = np.zeros(replicas, bool)
-        self.has_claimed: Bools = np.zeros((replicas, routes), bool)
-        self.claim_changed: Bools = np.zeros((replicas, routes), bool)
-        self._hit_slot: Numbers = np.full(replicas, EMPTY)
+        self._hit_slot: Numbers = np.full(replicas, NO_VEHICLE)
         self.collision: list[Collision | None] = [None] * replicas
 
     @property
     def collided(self) -> Bools:
         """Whether the ego has had a collision in the episode; (R,)."""
-        return np.asarray(self._hit_slot != EMPTY)
+        return np.asarray(self._hit_slot != NO_VEHICLE)
 
-    def begin(self, replica: int) -> None:
-        """Put an ego at its start, where it stands."""
-        self.forget(replica)
-        self.front_m[replica] = self._layout.scene.ego.start_m
-        self._place(slice(replica, replica + 1))
-
-    def forget(self, replica: int) -> None:
-        """Forget what happened in a replica."""
+    def clear(self, replica: int) -> None:
+        """Forget the episode of a replica."""
         self.front_m[replica] = self.speed_mps[replica] = 0.0
-        self.pose[replica] = np.zeros((), POSE)
+        self.box[replica] = self._nowhere[0]
         self.distance_m[replica] = self._was_distance_m[replica] = np.inf
         self.unsafe[replica] = False
-        self.has_claimed[replica] = self.claim_changed[replica] = False
-        self._hit_slot[replica] = EMPTY
+        self._hit_slot[replica] = NO_VEHICLE
         self.collision[replica] = None
 
-    def _place(self, replicas: slice) -> None:
-        layout = self._layout
-        place(self.front_m[replicas], layout.ego.way, layout.scene.vehicle.length_m, self.pose[replicas])
-
     def drive(self, desired_mps: Floats) -> None:
-        """Move on by a step."""
+        """Choose the speeds of a step, and move the fronts on; the boxes follow."""
         drive(desired_mps, self.unsafe, self._rules, self.speed_mps, self.front_m)
-        self._place(slice(None))
-
-    @does(StepPart.CLAIMS)
-    def update_claims(self) -> bool:
-        """Claim routes and give them up; ``claim_changed`` (R, K) tells where that changed, the answer whether any."""
-        zones = self._layout.zones
-        return update_claims(
-            self.front_m,
-            self.speed_mps,
-            zones.enter_m,
-            zones.inside_m,
-            zones.towards,
-            self._rules,
-            self.has_claimed,
-            self.claim_changed,
-        )
 
     @does(StepPart.SAFETY_CHECK)
-    def look_around(self, slots: Slots) -> None:
-        """Run the safety check for the next step, and latch collisions."""
-        shape = self._layout.scene.vehicle
+    def look_around(self, slots: Slots) -> Sequence[tuple[int, int]]:
+        """Run the safety check for the next step; return replica and slot of each episode's first collision."""
         self.distance_m, self._was_distance_m = self._was_distance_m, self.distance_m
-        measure_distances_m(
-            self.pose, slots.present, slots.pose, self._reach_m, shape.length_m, shape.width_m, self.distance_m
-        )
-        if check_safety(
-            self.distance_m,
-            self._was_distance_m,
-            self.pose,
-            slots.pose,
-            self._rules,
-            self.unsafe,
-            self._hit_slot,
+        measure_distances_m(self.box, slots.present, slots.box, self._reach_m, self.distance_m)
+        if not check_safety(
+            self.distance_m, self._was_distance_m, self.box, slots.box, self._rules, self.unsafe, self._hit_slot
         ):
-            for replica in np.flatnonzero(self.collided).tolist():
-                if self.collision[replica] is None:
-                    self.collision[replica] = self._collision(replica, int(self._hit_slot[replica]), slots)
-
-    def _collision(self, replica: int, slot: int, slots: Slots) -> Collision:
-        route = self._layout.scene.routes[slots.route[replica, slot]].name
-        pose = self.pose[replica]
-        return Collision(slot, int(slots.member[replica, slot]), route, float(pose["x_m"]), float(pose["y_m"]))
+            return ()
+        collided = np.flatnonzero(self.collided).tolist()
+        return [(replica, int(self._hit_slot[replica])) for replica in collided if self.collision[replica] is None]
 
 
 @compiled
 def acceleration_mps2(speed_mps: float, desired_mps: float, unsafe: bool, rules: EgoRules) -> float:
-    """The PD law, or braking where the safety check fires."""
+    """Return what the PD law asks for, or braking where the safety check fires."""
     if unsafe:
         return max(-rules.braking_gain_per_s * speed_mps, -rules.braking_limit_mps2)
     wanted_mps2 = rules.gain_per_s * (desired_mps - speed_mps)
@@ -186,7 +135,7 @@ def drive(desired_mps: Floats, unsafe: Bools, rules: EgoRules, speed_mps: Floats
 
 @compiled
 def is_unsafe(distance_m: float, closing_mps: float, rules: EgoRules) -> bool:
-    """Whether a vehicle is dangerously close."""
+    """Return whether a vehicle is dangerously close."""
     close = distance_m < rules.unsafe_distance_m
     return close or (distance_m < rules.closing_distance_m and closing_mps > rules.closing_speed_mps)
 
@@ -195,22 +144,22 @@ def is_unsafe(distance_m: float, closing_mps: float, rules: EgoRules) -> bool:
 def check_safety(
     distance_m: Floats,
     before_m: Floats,
-    egos: Poses,
-    vehicles: Poses,
+    egos: Boxes,
+    vehicles: Boxes,
     rules: EgoRules,
     unsafe: Bools,
     hit: Numbers,
 ) -> bool:
-    """Look at the vehicles around each ego.
+    """Check the vehicles around each ego.
 
     Args:
         distance_m, before_m: (R, V) to vehicles, now and a step ago; infinite where there is none, or none was.
-        egos, vehicles: (R,) and (R, V) poses.
+        egos, vehicles: (R,) and (R, V) boxes.
         unsafe: (R,) written: whether any vehicle is dangerously close.
-        hit: (R,) the first slot whose vehicle the ego has touched, written where it was -1.
+        hit: (R,) the first slot whose vehicle the ego has touched, written where it was negative.
 
     Returns:
-        whether any ego has newly touched a vehicle.
+        whether any ego has touched a vehicle for the first time.
     """
     any_new = False
     for row in range(len(unsafe)):
@@ -219,7 +168,7 @@ def check_safety(
             now_m, was_m = distance_m[row, slot], before_m[row, slot]
             closing_mps = (was_m - now_m) / rules.step_s if math.isfinite(was_m) else 0.0
             if is_unsafe(now_m, closing_mps, rules):
-                counts = rules.watches_behind or not is_behind(vehicles[row, slot], egos[row], rules.half_length_m)
+                counts = rules.watches_behind or not is_behind(vehicles[row, slot], egos[row])
                 unsafe[row] = unsafe[row] or counts
             if now_m == 0.0 and hit[row] < 0:
                 hit[row] = slot
@@ -228,39 +177,7 @@ def check_safety(
 
 
 @compiled
-def is_behind(vehicle: Any, ego: Any, half_length_m: float) -> bool:
-    """Whether a vehicle's centre is behind an ego's back; both are poses."""
+def is_behind(vehicle: Any, ego: Any) -> bool:
+    """Return whether a vehicle's centre is behind an ego's back; both are boxes."""
     ahead_m = (vehicle.x_m - ego.x_m) * ego.heading_x + (vehicle.y_m - ego.y_m) * ego.heading_y
-    return bool(ahead_m < -half_length_m)
-
-
-@compiled
-def update_claims(
-    front_m: Floats,
-    speed_mps: Floats,
-    enter_m: Floats,
-    inside_m: Floats,
-    towards: Floats,
-    rules: EgoRules,
-    claimed: Bools,
-    changed: Bools,
-) -> bool:
-    """Write which routes each ego claims and where that changed, both (R, K); whether any did.
-
-    An ego claims a route once its front has entered the lane and it either moves in or stands in the vehicles' path.
-    Without the second condition a standing ego could probe drivers at no risk.
-
-    Args:
-        front_m, speed_mps: (R,).
-        enter_m, inside_m, towards: (K,), (K,) and (K, P); see ``tint_sumo.scenes.layout.ConflictZones``.
-    """
-    any_changed = False
-    for row in range(len(front_m)):
-        index = min(max(int(front_m[row] / rules.way_spacing_m), 0), towards.shape[1] - 1)
-        for route in range(len(enter_m)):
-            moves_in = speed_mps[row] * towards[route, index] > rules.approach_speed_mps
-            now = front_m[row] > enter_m[route] and (moves_in or front_m[row] > inside_m[route])
-            changed[row, route] = now != claimed[row, route]
-            claimed[row, route] = now
-            any_changed = any_changed or changed[row, route]
-    return any_changed
+    return bool(ahead_m < -ego.length_m / 2)

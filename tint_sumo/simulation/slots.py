@@ -1,102 +1,66 @@
-"""Which vehicle is in which slot, and where it is."""
+"""The vehicle slots of a simulation: which vehicle is in which slot, and where it is."""
 
 import numpy as np
 
-from tint_sumo.scenes.geometry import POSE, Bools, Floats, Numbers, Poses, follow
-from tint_sumo.scenes.layout import Layout
-
-EMPTY = -1
+from tint_sumo.scenes.geometry import BOX, NO_VEHICLE, Bools, Boxes, Floats, Numbers
 
 
 class Slots:
-    """The vehicles of R replicas in V slots each; arrays are (R, V) where nothing else is said.
+    """The vehicles of R replicas in V slots each; arrays are (R, V).
 
     ================== =========================================================================================
     ``present``        which slots hold a vehicle
-    ``route``          number of its route
-    ``stage``          on which of the route's SUMO lanes it is
-    ``front_m``        front bumper's distance along the route
-    ``pose``           records of ``tint_sumo.scenes.geometry.POSE``; ``x_m`` and ``y_m`` are its fields
-    ``member``         index into the population, -1 in empty slots
-    ``vehicle_number`` running number of the vehicle in its replica's episode, -1 in empty slots
-    ``newest``         (R, K) slot of the vehicle that entered each route last, -1 if it has left
+    ``route``          number of its route; 0 where SUMO's demand gives the routes
+    ``front_m``        front bumper's distance along the route; where SUMO gives the routes, its odometer
+    ``box``            records of ``tint_sumo.scenes.geometry.BOX``
+    ``member``         number of its driver in the population, or of its vType; ``NO_VEHICLE`` in empty slots
+    ``vehicle_number`` running number of the vehicle in its replica's episode; ``NO_VEHICLE`` in empty slots
     ================== =========================================================================================
 
-    A vehicle keeps its slot while it is on the roads, and a slot stays empty for at least a step between two.
+    A vehicle keeps its slot while it is on the roads or, of a SUMO configuration, one of the nearest in sight. A slot
+    stays empty for at least a step between two vehicles.
     """
 
-    def __init__(self, replicas: int, layout: Layout) -> None:
-        self._layout = layout
-        shape = (replicas, layout.scene.max_vehicles)
+    def __init__(self, replicas: int, max_vehicles: int) -> None:
+        shape = (replicas, max_vehicles)
         self.present: Bools = np.zeros(shape, bool)
         self.route: Numbers = np.zeros(shape, np.int64)
-        self.stage: Numbers = np.zeros(shape, np.int64)
         self.front_m: Floats = np.zeros(shape)
-        self.pose: Poses = np.zeros(shape, POSE)
-        self.x_m: Floats = self.pose["x_m"]
-        self.y_m: Floats = self.pose["y_m"]
-        self.member: Numbers = np.full(shape, EMPTY)
-        self.vehicle_number: Numbers = np.full(shape, EMPTY)
-        self._lane_pos_m: Floats = np.zeros(shape)
+        self.box: Boxes = np.zeros(shape, BOX)
+        self.length_m: Floats = self.box["length_m"]
+        self.width_m: Floats = self.box["width_m"]
+        self.member: Numbers = np.full(shape, NO_VEHICLE)
+        self.vehicle_number: Numbers = np.full(shape, NO_VEHICLE)
         # A slot that held a vehicle at the previous step takes no new one yet.
         self._was_present: Bools = np.zeros(shape, bool)
-        self._newcomer, self._newcomer_pos_m = np.zeros(1, np.int64), np.zeros(1)
-        self.newest: Numbers = np.full((replicas, len(layout.routes)), EMPTY)  # slot of each route's last newcomer
 
-    def take(self, replica: int, slot: int, route: int, front_m: float, member: int, number: int) -> None:
-        """Take over a vehicle that appears in an empty slot."""
-        stage, lane_pos_m = self._layout.routes[route].lane_at(front_m)
+    def take(
+        self, replica: int, slot: int, *, member: int, number: int, length_m: float, width_m: float, route: int = 0
+    ) -> None:
+        """Put a vehicle into an empty slot; where it is follows."""
         self.present[replica, slot] = True
         self.route[replica, slot] = route
-        self.stage[replica, slot] = stage
         self.member[replica, slot] = member
         self.vehicle_number[replica, slot] = number
-        self.newest[replica, route] = slot
-        self._lane_pos_m[replica, slot] = lane_pos_m
-        self._newcomer[0], self._newcomer_pos_m[0] = self.index(replica, slot), lane_pos_m
-        self.follow(self._newcomer, self._newcomer_pos_m)
+        self.length_m[replica, slot], self.width_m[replica, slot] = length_m, width_m
 
     def leave(self, replica: int, slot: int) -> None:
-        """Empty the slot of a vehicle that has left the roads."""
+        """Empty the slot of a vehicle that has left."""
         self.present[replica, slot] = False
-        self.member[replica, slot] = EMPTY
-        self.vehicle_number[replica, slot] = EMPTY
-        route = self.route[replica, slot]
-        if self.newest[replica, route] == slot:
-            self.newest[replica, route] = EMPTY
+        self.member[replica, slot] = self.vehicle_number[replica, slot] = NO_VEHICLE
 
     def begin_step(self) -> None:
+        """Remember which slots are taken; those that become empty in this step stay so until the next one."""
         np.copyto(self._was_present, self.present)
 
     def clear(self, replica: int) -> None:
         """Empty all slots of a replica as if they had never held a vehicle; they may be taken at once."""
-        for array in (self.present, self.route, self.stage, self.front_m, self._lane_pos_m, self._was_present):
+        for array in (self.present, self.route, self.front_m, self._was_present):
             array[replica] = 0
-        self.pose[replica] = np.zeros((), POSE)
-        for array in (self.member, self.vehicle_number, self.newest):
-            array[replica] = EMPTY
+        self.box[replica] = np.zeros((), BOX)
+        self.member[replica] = self.vehicle_number[replica] = NO_VEHICLE
 
     def free(self, replica: int) -> int:
-        """A slot that may be taken, -1 if there is none."""
+        """Return the first slot that may be taken; ``NO_VEHICLE`` if there is none."""
         free = np.flatnonzero(~(self.present[replica] | self._was_present[replica]))
-        return int(free[0]) if len(free) else EMPTY
-
-    def index(self, replica: int, slot: int) -> int:
-        """Number of a slot among all replicas' slots."""
-        return replica * int(self.present.shape[1]) + slot
-
-    def follow(self, index: Numbers, lane_pos_m: Floats) -> None:
-        """Take over from SUMO where the vehicles in some slots (K,) are on their lanes (K,)."""
-        layout = self._layout
-        follow(
-            index,
-            lane_pos_m,
-            self.route.ravel(),
-            layout.lane_start_m,
-            layout.ways,
-            layout.scene.vehicle.length_m,
-            self.stage.ravel(),
-            self._lane_pos_m.ravel(),
-            self.front_m.ravel(),
-            self.pose.ravel(),
-        )
+        return int(free[0]) if len(free) else NO_VEHICLE

@@ -11,7 +11,7 @@ from tint_sumo.envs.episodes import episode_seed
 from tint_sumo.methods.evaluation import BATCH, case_seed
 from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene
 from tint_sumo.scenes.layout import Layout
-from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation.scene import SceneSimulation
 
 
 def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str | Scene = T_INTERSECTION) -> float:
@@ -28,7 +28,7 @@ def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str | Sc
     played = find_scene(scene)
     played = replace(played, traffic=replace(played.traffic, p_conservative=p_conservative))
     finished = 0
-    simulation = Simulation(min(BATCH, episodes), played, with_ego=False)
+    simulation = SceneSimulation(min(BATCH, episodes), played, with_ego=False)
     try:
         for first in range(0, episodes, simulation.replicas):
             count = min(simulation.replicas, episodes - first)
@@ -41,7 +41,7 @@ def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str | Sc
     return finished / episodes
 
 
-def _finishes(simulation: Simulation) -> NDArray[np.bool_]:
+def _finishes(simulation: SceneSimulation) -> NDArray[np.bool_]:
     """Which replicas let a careful ego through before the time limit; (R,)."""
     scene, layout = simulation.scene, simulation.layout
     way_s = way_m(layout) / max(scene.ego.controller.desired_speeds_mps)
@@ -63,7 +63,7 @@ def way_m(layout: Layout) -> NDArray[np.float64]:
     return np.diff([task.start_m, *np.sort(layout.zones.enter_m), task.goal_m])
 
 
-def _openings(simulation: Simulation) -> list[list[list[tuple[float, float]]]]:
+def _openings(simulation: SceneSimulation) -> list[list[list[tuple[float, float]]]]:
     """Of each replica and route: from when to when the next driver to reach the ego's way is one that yields.
 
     The replicas are driven to their time limit.

@@ -272,7 +272,7 @@ def encode(moments: Sequence[Moment], reader: TraitReader | None, routes: Sequen
 
 def _ego(moments: Sequence[Moment]) -> dict[str, Column]:
     columns = {
-        **_pose(np.array([moment.ego for moment in moments])),
+        **_positions(np.array([moment.ego for moment in moments])),
         "speed_mps": [moment.ego_mps for moment in moments],
         "brakes": [moment.ego_brakes for moment in moments],
         "held": [moment.is_held for moment in moments],
@@ -289,7 +289,7 @@ def _vehicle(
     frames, slots = np.nonzero(numbers == number)
     slot, own = int(slots[0]), [moments[frame] for frame in frames.tolist()]
     columns: dict[str, Any] = {
-        **_pose(np.array([moment.poses[slot] for moment in own])),
+        **_positions(np.array([moment.boxes[slot] for moment in own])),
         "brakes": [moment.brakes[slot] for moment in own],
     }
     if own[0].attention is not None:
@@ -306,9 +306,9 @@ def _vehicle(
     }
 
 
-def _pose(poses: NDArray[np.void]) -> dict[str, Any]:
-    heading = np.unwrap(np.arctan2(poses["heading_y"], poses["heading_x"]))
-    return {"x_m": poses["x_m"], "y_m": poses["y_m"], "heading_deg": np.degrees(heading)}
+def _positions(boxes: NDArray[np.void]) -> dict[str, Any]:
+    heading = np.unwrap(np.arctan2(boxes["heading_y"], boxes["heading_x"]))
+    return {"x_m": boxes["x_m"], "y_m": boxes["y_m"], "heading_deg": np.degrees(heading)}
 
 
 def _column(name: str, values: Any) -> Column:

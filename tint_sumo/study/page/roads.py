@@ -25,7 +25,7 @@ def scene_shapes(place: str | Scene) -> dict[str, Any]:
     borders = [lane.offset_curve(side_m) for lane in lanes for side_m in (half_m, -half_m)]
     return {
         "view": [view.left_m, -view.top_m, view.right_m - view.left_m, view.top_m - view.bottom_m],
-        "roads": "".join(_path(ring, closed=True) for ring in _rings(roads.roads)),
+        "roads": "".join(_path(ring, closed=True) for area in roads.roads.paved.geometries for ring in _rings(area)),
         "borders": "".join(_path(shapely.get_coordinates(border)) for border in borders),
         "lane_width_m": scene.network.lane_width_m,
         "routes": {

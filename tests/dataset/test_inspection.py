@@ -1,9 +1,8 @@
-"""What is told of a dataset, against pandas on all of it at once."""
+"""Inspection of a dataset, against pandas on all of it at once."""
 
 import json
 import shutil
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -15,7 +14,7 @@ from PIL import Image
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.inspection import QUANTILES, Distribution, Inspection, TraitStatistics, inspect, plot, report
-from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES
+from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, read_manifest
 
 CENTS = st.lists(st.integers(0, 400), min_size=1, max_size=50).map(lambda cents: np.array(cents) / 100)
 
@@ -25,11 +24,11 @@ def test_parts_add_up(first: np.ndarray, second: np.ndarray) -> None:
     both = np.r_[first, second]
     added = Distribution.of(pd.Series(first)) + Distribution.of(pd.Series(second))
     assert np.repeat(added.value, added.count) == pytest.approx(np.sort(both))
-    told = added.summary()
-    assert told["count"] == len(both)
-    assert told["mean"] == pytest.approx(both.mean(), abs=1e-4)
-    assert told["sd"] == pytest.approx(both.std(), abs=1e-4)
-    assert (told["min"], told["max"]) == (both.min(), both.max())
+    summary = added.summary()
+    assert summary["count"] == len(both)
+    assert summary["mean"] == pytest.approx(both.mean(), abs=1e-4)
+    assert summary["sd"] == pytest.approx(both.std(), abs=1e-4)
+    assert (summary["min"], summary["max"]) == (both.min(), both.max())
     for fraction in QUANTILES:
         assert added.quantile(fraction) == pytest.approx(np.quantile(both, fraction, method="inverted_cdf"))
 
@@ -39,7 +38,7 @@ def test_nulls_do_not_count() -> None:
     assert Distribution.of(pd.Series([np.nan])).summary() == {"count": 0}
 
 
-def test_it_tells_what_is_in_the_tables(two_shards: Path) -> None:
+def test_summaries_are_those_of_the_tables(two_shards: Path) -> None:
     found = inspect(two_shards, progress=False)
     rows, drivers = (pd.read_parquet(two_shards / part) for part in (TRAJECTORIES, DRIVERS))
     rows = rows.merge(drivers, on=["episode", "vehicle"])
@@ -48,12 +47,12 @@ def test_it_tells_what_is_in_the_tables(two_shards: Path) -> None:
         assert one["rows"] == len(mine) > 1000
         assert one["drivers"] == (drivers["trait"] == trait).sum()
         for column in ("speed_mps", "gap_m"):
-            told = one[column]
-            assert told["count"] == mine[column].count()
-            assert told["mean"] == pytest.approx(mine[column].mean(), abs=0.005)
-            assert told["sd"] == pytest.approx(mine[column].std(), abs=0.005)
+            summary = one[column]
+            assert summary["count"] == mine[column].count()
+            assert summary["mean"] == pytest.approx(mine[column].mean(), abs=0.005)
+            assert summary["sd"] == pytest.approx(mine[column].std(), abs=0.005)
             for fraction in QUANTILES:
-                assert told[f"q{100 * fraction:g}"] == pytest.approx(mine[column].quantile(fraction), abs=0.011)
+                assert summary[f"q{100 * fraction:g}"] == pytest.approx(mine[column].quantile(fraction), abs=0.011)
         times = mine.groupby(["episode", "vehicle"])["time_s"]
         assert one["track_s"]["mean"] == pytest.approx((times.max() - times.min()).mean(), abs=0.005)
     assert found.episode_s.summary()["count"] == rows["episode"].nunique() == 32
@@ -62,7 +61,7 @@ def test_it_tells_what_is_in_the_tables(two_shards: Path) -> None:
     json.dumps(found.summary())
 
 
-def test_the_report_tells_the_manifest_and_every_distribution(dataset: Path) -> None:
+def test_the_report_shows_the_manifest_and_every_distribution(dataset: Path) -> None:
     text = report(inspect(dataset, progress=False))
     for key, value in json.loads((dataset / MANIFEST).read_text()).items():
         assert f"{key} " in text
@@ -79,10 +78,10 @@ def test_the_figure(dataset: Path, tmp_path: Path) -> None:
         assert tuple(map(int, profile.colour.split(","))) in colours
 
 
-def test_a_trait_nobody_has(tmp_path: Path) -> None:
+def test_a_trait_nobody_has(dataset: Path, tmp_path: Path) -> None:
     some = Distribution.of(pd.Series([2.4]))
     lonely = Inspection(
-        MappingProxyType({"windows": 1, "population": "traits"}),
+        read_manifest(dataset),
         {"conservative": TraitStatistics(1, 1, some, some, some), "aggressive": TraitStatistics()},
         some,
         some,

@@ -1,6 +1,5 @@
 """Recording, with real simulations."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from tests.simulation.scenes import T
 from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.recorder import EPISODE_STEPS, EPISODES_PER_SHARD, record, simulate_episodes
-from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES
+from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, read_manifest
 from tint_sumo.simulation import SceneSimulation
 
 WINDOWS = 3000  # one shard
@@ -106,10 +105,10 @@ def test_time_runs_evenly_along_each_track(dataset: Path) -> None:
 
 
 def test_pandas_reads_a_folder_as_one_table(two_shards: Path) -> None:
-    manifest = json.loads((two_shards / MANIFEST).read_text())
+    manifest = read_manifest(two_shards)
     rows = pd.read_parquet(two_shards / TRAJECTORIES)
-    assert len(rows) == manifest["rows"]
-    assert rows["episode"].unique().tolist() == list(range(manifest["episodes"]))
+    assert len(rows) == manifest.rows
+    assert rows["episode"].unique().tolist() == list(range(manifest.episodes))
     assert rows.set_index(["episode", "vehicle", "time_s"]).index.is_monotonic_increasing
     assert rows.dtypes.astype(str).to_dict() == {
         "episode": "int32",
@@ -124,7 +123,7 @@ def test_pandas_reads_a_folder_as_one_table(two_shards: Path) -> None:
     }
     one = pd.read_parquet(two_shards / TRAJECTORIES, columns=["gap_m"], filters=[("episode", "==", 17)])
     assert len(one) == (rows["episode"] == 17).sum()
-    assert len(pd.read_parquet(two_shards / DRIVERS)) == manifest["drivers"]
+    assert len(pd.read_parquet(two_shards / DRIVERS)) == manifest.drivers
 
 
 def test_columns_carry_their_units(dataset: Path) -> None:
@@ -144,8 +143,8 @@ def test_the_share_of_conservative_drivers_is_the_one_asked_for(tmp_path: Path) 
 
 def test_the_dataset_does_not_depend_on_the_number_of_workers(two_shards: Path, tmp_path: Path) -> None:
     manifest = record(tmp_path, TWO_SHARDS, workers=2, fcd=True, progress=False)
-    assert manifest == json.loads((two_shards / MANIFEST).read_text())
-    assert manifest["shards"] == 2
+    assert manifest == read_manifest(two_shards)
+    assert manifest.shards == 2
     assert contents(tmp_path) == contents(two_shards)
 
 
@@ -191,7 +190,7 @@ def test_a_folder_of_another_run_is_left_alone(dataset: Path, tmp_path: Path) ->
 def test_drivers_without_classes_are_recorded_by_the_same_command(tmp_path: Path) -> None:
     manifest = record(tmp_path / "d", WINDOWS, population="continuous", progress=False)
     drivers = pd.read_parquet(tmp_path / "d" / DRIVERS)
-    assert manifest["population"] == "continuous"
+    assert manifest.population == "continuous"
     assert set(drivers["trait"]) == {"continuous"}
     assert drivers["desired_speed_mps"].between(2.0, 3.4).all()
     assert drivers["desired_speed_mps"].nunique() > 100

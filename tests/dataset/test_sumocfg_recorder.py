@@ -1,8 +1,8 @@
 """Recording a SUMO configuration, and learning from that."""
 
-import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from tint_sumo.cli import main
 from tint_sumo.config import TraitSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.inspection import Distribution, Inspection, TraitStatistics, _boxes, inspect, plot
-from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, shard_file
+from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, read_manifest, shard_file
 from tint_sumo.dataset.shards import EPISODE_STEPS
 from tint_sumo.dataset.sumocfg_recorder import EPISODES_PER_SHARD, record_sumocfg
 from tint_sumo.dataset.windows import load_labels, load_windows
@@ -40,9 +40,9 @@ def test_every_network_is_recorded_in_steps_of_windows(name: str, user_network: 
     manifest = record_sumocfg(network.sumocfg, tmp_path / "d", 100, progress=False)
     rows = pd.read_parquet(tmp_path / "d" / TRAJECTORIES)
     drivers = pd.read_parquet(tmp_path / "d" / DRIVERS)
-    assert manifest["population"] == list(network.scene().vtypes)
-    assert manifest["scene"] == network.sumocfg.stem
-    assert (manifest["episodes"], manifest["rows"], manifest["drivers"]) == (
+    assert manifest.traits == network.scene().vtypes
+    assert manifest.scene == network.sumocfg.stem
+    assert (manifest.episodes, manifest.rows, manifest.drivers) == (
         EPISODES_PER_SHARD,
         len(rows),
         len(drivers),
@@ -60,7 +60,7 @@ def test_every_network_is_recorded_in_steps_of_windows(name: str, user_network: 
     assert set(rows["route"]) == {""}
     assert not drivers.duplicated(keys).any()
     assert set(map(tuple, drivers[keys].to_numpy())) == set(map(tuple, rows[keys].drop_duplicates().to_numpy()))
-    assert set(drivers["trait"]) <= set(manifest["population"])
+    assert set(drivers["trait"]) <= set(manifest.traits)
 
 
 def test_drivers_have_what_their_vtype_says(merge_data: Path) -> None:
@@ -100,8 +100,8 @@ def test_the_dataset_is_the_same_with_workers_and_after_an_interruption(
     shard_file(interrupted, TRAJECTORIES, 1).unlink()
     manifest = record_sumocfg(sumocfg, interrupted, TWO_SHARDS, progress=False)
     assert contents(interrupted) == contents(merge_data)
-    assert manifest == json.loads((merge_data / MANIFEST).read_text())
-    assert manifest["shards"] == 2
+    assert manifest == read_manifest(merge_data)
+    assert manifest.shards == 2
 
 
 def test_a_vehicle_that_sumo_teleports_appears_anew(user_network: Make, tmp_path: Path) -> None:
@@ -158,11 +158,10 @@ def test_the_dataset_can_be_inspected(merge_data: Path, tmp_path: Path) -> None:
     assert (tmp_path / "found.png").stat().st_size > 10_000
 
 
-def test_the_figure_of_many_vtypes_names_those_that_drive_and_has_room_for_them() -> None:
+def test_the_figure_of_many_vtypes_names_those_that_drive_and_has_room_for_them(merge_data: Path) -> None:
     values = Distribution.of(pd.Series([0.0, 2.0, 400.0]))
     traits = {f"vtype_{one}": TraitStatistics(one, one, values, values, values) for one in range(40)}
-    manifest = {"windows": 7, "vtypes": list(traits), "population": None}
-    figure = _boxes(Inspection(manifest, traits, values, values))
+    figure = _boxes(Inspection(replace(read_manifest(merge_data), windows=7), traits, values, values))
     speed, *_ = figure.axes
     names = [label.get_text() for label in speed.get_yticklabels()]
     assert names == [f"vtype_{one} ({one} drivers)" for one in range(39, 15, -1)]

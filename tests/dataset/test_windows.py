@@ -4,7 +4,7 @@ import json
 import resource
 import shutil
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,15 @@ from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, NO_LEADER_GAP_M
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset import windows as module
 from tint_sumo.dataset.recorder import EPISODES_PER_SHARD, record, simulate_episodes
-from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, TRAJECTORY_SCHEMA, read_shard, verify
+from tint_sumo.dataset.schema import (
+    DRIVERS,
+    MANIFEST,
+    TRAJECTORIES,
+    TRAJECTORY_SCHEMA,
+    read_manifest,
+    read_shard,
+    verify,
+)
 from tint_sumo.dataset.windows import (
     WindowFile,
     Windows,
@@ -25,7 +33,6 @@ from tint_sumo.dataset.windows import (
     joined,
     load_labels,
     load_windows,
-    read_manifest,
     read_training_windows,
     read_windows,
     split_by_episode,
@@ -259,9 +266,9 @@ def test_tables_with_other_values_than_finite_numbers(
 
 def test_files_are_verified(dataset: Path, tmp_path: Path) -> None:
     manifest = read_manifest(dataset)
-    assert verify(dataset, manifest) == 2 * manifest["shards"]
+    assert verify(dataset, manifest) == 2 * manifest.shards
     with pytest.raises(InputError, match="has no checksums"):
-        verify(dataset, {**manifest, "sha256": None})
+        verify(dataset, replace(manifest, sha256=None))
 
 
 def test_missing_labels(dataset: Path, tmp_path: Path) -> None:

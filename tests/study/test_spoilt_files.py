@@ -17,7 +17,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import RUN_FILE, claim_folder, shipped, write_json
 from tint_sumo.core.progress import silent
 from tint_sumo.dataset.recorder import record
-from tint_sumo.dataset.windows import read_manifest
+from tint_sumo.dataset.schema import read_manifest
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.policy.storage import read_versions
 from tint_sumo.scenes import described

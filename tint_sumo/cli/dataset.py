@@ -48,7 +48,7 @@ class Record(SpreadCommand):
         if sumocfg is not None:
             self._require_nothing_but_the_configuration()
             manifest = record_sumocfg(sumocfg, self.out, self.windows, seed=self.seed, workers=self.workers)
-            return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
+            return Outcome(f"{manifest.windows} windows in {self.out}", manifest.content())
         with self.workers_of(self.workers) as workers:
             manifest = record(
                 self.out,
@@ -60,7 +60,7 @@ class Record(SpreadCommand):
                 workers=workers,
                 fcd=self.format == "fcd",
             )
-        return Outcome(f"{manifest['windows']} windows in {self.out}", manifest)
+        return Outcome(f"{manifest.windows} windows in {self.out}", manifest.content())
 
     def _require_nothing_but_the_configuration(self) -> None:
         names = ["p_conservative", "population", "format"]
@@ -90,8 +90,7 @@ class InspectDataset(Command):
 
     def run(self) -> Outcome:
         from tint_sumo.dataset.inspection import inspect, plot, report
-        from tint_sumo.dataset.schema import verify
-        from tint_sumo.dataset.windows import read_manifest
+        from tint_sumo.dataset.schema import read_manifest, verify
 
         if self.figure is not None:
             require_output_file(self.figure, PICTURE_SUFFIXES, "figure")

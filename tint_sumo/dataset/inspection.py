@@ -1,11 +1,11 @@
-"""What is in a recorded dataset: counts, and distributions per trait.
+"""Contents of a recorded dataset: counts, and distributions per trait.
 
 Shards are read one after the other and only counts of rounded values are kept, so that memory does not grow with the
 dataset. Labels are joined here to describe the data; no input of a model comes from here.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import whole_file
 from tint_sumo.core.progress import make_bar
-from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, read_shards
-from tint_sumo.dataset.windows import drivers_of, own_vtypes, read_manifest
+from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, Manifest, read_manifest, read_shards
 
 RESOLUTION = 0.01  # m, m/s or s: values are rounded to multiples of it
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -33,14 +32,14 @@ _KEYS = ["episode", "vehicle"]
 
 @dataclass(frozen=True)
 class Distribution:
-    """How often each value occurs, values rounded to 0.01."""
+    """Counts of values that are rounded to 0.01."""
 
     value: NDArray[np.float64]  # (K,), increasing
     count: NDArray[np.int64]  # (K,)
 
     @classmethod
     def of(cls, values: pd.Series) -> "Distribution":
-        """Of the values that are not null."""
+        """Return the distribution of the values that are not null."""
         level, count = np.unique(np.rint(values.dropna().to_numpy(np.float64) / RESOLUTION), return_counts=True)
         return cls(level * RESOLUTION, count)
 
@@ -50,12 +49,12 @@ class Distribution:
         return Distribution(value * RESOLUTION, count)
 
     def quantile(self, fraction: float) -> float:
-        """The smallest value that at least this fraction does not exceed."""
+        """Return the smallest value that at least this fraction does not exceed."""
         reached = np.cumsum(self.count) >= fraction * self.count.sum()
         return round(float(self.value[reached.argmax()]), 2)
 
     def summary(self) -> dict[str, Any]:
-        """count, mean, sd, min, quantiles and max; the count alone if there is nothing."""
+        """Return count, mean, sd, min, quantiles and max; the count alone if it is 0."""
         total = int(self.count.sum())
         if total == 0:
             return {"count": 0}
@@ -76,7 +75,7 @@ NOTHING = Distribution(np.empty(0), np.empty(0, np.int64))
 
 @dataclass(frozen=True)
 class TraitStatistics:
-    """Of all drivers with one trait."""
+    """Counts and distributions of all drivers with one trait."""
 
     drivers: int = 0
     rows: int = 0
@@ -85,35 +84,27 @@ class TraitStatistics:
     track_s: Distribution = NOTHING  # time on the street
 
     def __add__(self, other: "TraitStatistics") -> "TraitStatistics":
-        return TraitStatistics(
-            self.drivers + other.drivers,
-            self.rows + other.rows,
-            self.speed_mps + other.speed_mps,
-            self.gap_m + other.gap_m,
-            self.track_s + other.track_s,
-        )
+        return TraitStatistics(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
 
     def summary(self) -> dict[str, Any]:
-        return {
-            "drivers": self.drivers,
-            "rows": self.rows,
-            "speed_mps": self.speed_mps.summary(),
-            "gap_m": self.gap_m.summary(),
-            "track_s": self.track_s.summary(),
-        }
+        """Return the counts, and the summaries of the distributions, by the names of the fields."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: one.summary() if isinstance(one, Distribution) else one for name, one in values.items()}
 
 
 @dataclass(frozen=True)
 class Inspection:
-    manifest: Mapping[str, Any]
+    """Manifest of a dataset, and distributions in its tables."""
+
+    manifest: Manifest
     traits: Mapping[str, TraitStatistics]  # by name of the trait
     episode_s: Distribution
     drivers_per_episode: Distribution
 
     def summary(self) -> dict[str, Any]:
-        """What JSON can hold of it."""
+        """Return manifest and summaries as JSON can hold them."""
         return {
-            "manifest": dict(self.manifest),
+            "manifest": self.manifest.content(),
             "traits": {trait: one.summary() for trait, one in self.traits.items()},
             "episode_s": self.episode_s.summary(),
             "drivers_per_episode": self.drivers_per_episode.summary(),
@@ -121,7 +112,7 @@ class Inspection:
 
 
 def inspect(folder: Path, progress: bool = True) -> Inspection:
-    """Go through a dataset, labels included.
+    """Read all of a dataset, labels included, and count.
 
     Raises:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
@@ -136,30 +127,29 @@ def inspect(folder: Path, progress: bool = True) -> Inspection:
         episode_s += Distribution.of(episodes["time_s"].max())
         drivers_per_episode += Distribution.of(episodes["vehicle"].nunique())
     found = sum(one.rows for one in traits.values())
-    if found != manifest["rows"]:
+    if found != manifest.rows:
         raise InputError(
-            f"{folder} has {found} of {manifest['rows']} rows with their drivers; "
+            f"{folder} has {found} of {manifest.rows} rows with their drivers; "
             "repeat the command that recorded the dataset"
         )
     return Inspection(manifest, traits, episode_s, drivers_per_episode)
 
 
-def _colours(manifest: Mapping[str, Any]) -> dict[str, Colour]:
-    """Of each trait."""
-    vtypes = own_vtypes(manifest)
-    if vtypes is None:
-        return {profile.name: profile.rgb for profile in drivers_of(manifest).profiles}
+def _colours(manifest: Manifest) -> dict[str, Colour]:
+    """Return each trait's colour."""
+    if manifest.profiles is not None:
+        return {profile.name: profile.rgb for profile in manifest.profiles}
     palette = colormaps["tab10"]
-    return {vtype: palette(number % palette.N)[:3] for number, vtype in enumerate(vtypes)}
+    return {vtype: palette(number % palette.N)[:3] for number, vtype in enumerate(manifest.traits)}
 
 
-def _shards(folder: Path, manifest: Mapping[str, Any], progress: bool) -> Iterator[pd.DataFrame]:
-    """Rows of each shard with their drivers' traits."""
+def _shards(folder: Path, manifest: Manifest, progress: bool) -> Iterator[pd.DataFrame]:
+    """Yield the rows of each shard with their drivers' traits."""
     tables = (
         read_shards(folder, TRAJECTORIES, manifest, [*_KEYS, "time_s", "speed_mps", "gap_m"]),
         read_shards(folder, DRIVERS, manifest, [*_KEYS, "trait"]),
     )
-    with make_bar(total=manifest["shards"], desc="inspect", unit="shard", disable=not progress) as bar:
+    with make_bar(total=manifest.shards, desc="inspect", unit="shard", disable=not progress) as bar:
         for rows, drivers in zip(*tables, strict=True):
             yield rows.merge(drivers, on=_KEYS)
             bar.update()
@@ -178,9 +168,10 @@ def _statistics(rows: pd.DataFrame) -> TraitStatistics:
 
 
 def report(inspection: Inspection) -> str:
-    """The manifest and the distributions, for people."""
-    width = max(map(len, inspection.manifest))
-    lines = [f"{key:{width}}  {_told(value)}" for key, value in inspection.manifest.items()]
+    """Return the manifest and a table of the distributions, for people."""
+    content = inspection.manifest.content()
+    width = max(map(len, content))
+    lines = [f"{key:{width}}  {_printed(value)}" for key, value in content.items()]
     table = {
         "drivers per episode": inspection.drivers_per_episode,
         "episode (s)": inspection.episode_s,
@@ -198,7 +189,7 @@ def report(inspection: Inspection) -> str:
     return "\n".join([*lines, "", summaries.to_string(na_rep="")])
 
 
-def _told(value: object) -> str:
+def _printed(value: object) -> str:
     return ", ".join(f"{key} {one}" for key, one in value.items()) if isinstance(value, Mapping) else str(value)
 
 
@@ -208,7 +199,7 @@ def plot(inspection: Inspection, file: Path) -> None:
     The few profiles of a built-in scene are histograms; the vTypes of a SUMO configuration, which can be many, are rows
     of boxes.
     """
-    figure = _histograms(inspection) if own_vtypes(inspection.manifest) is None else _boxes(inspection)
+    figure = _histograms(inspection) if inspection.manifest.profiles else _boxes(inspection)
     with whole_file(file) as partial:
         figure.savefig(partial, format=file.suffix.lower().removeprefix("."))
 
@@ -250,7 +241,7 @@ def _draw_box(axes: Axes, distribution: Distribution, row: int) -> None:
 
 
 def _title(inspection: Inspection) -> str:
-    return f"{inspection.manifest['windows']:,} windows, {inspection.episode_s.count.sum():,} episodes of traffic"
+    return f"{inspection.manifest.windows:,} windows, {inspection.episode_s.count.sum():,} episodes of traffic"
 
 
 def _histograms(inspection: Inspection) -> Figure:
@@ -280,7 +271,7 @@ def _histograms(inspection: Inspection) -> Figure:
 
 
 def _draw(axes: Axes, distribution: Distribution, colour: Colour, width: float) -> None:
-    """A histogram; its edges lie between the rounded values."""
+    """Draw a histogram whose edges lie between the rounded values; nothing where there are no values."""
     if len(distribution.value) == 0:
         return
     first, last = (np.floor(end / width) for end in distribution.value[[0, -1]])

@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 from tint_sumo.config import Population, Share, find_population, population_name
 from tint_sumo.core.structures import plain
 from tint_sumo.dataset.fcd import write_fcd
-from tint_sumo.dataset.schema import FCD, SCHEMA_VERSION, TABLES, TRAJECTORIES, read_shard, shard_file, shard_path
+from tint_sumo.dataset.schema import (
+    FCD,
+    SCHEMA_VERSION,
+    TABLES,
+    TRAJECTORIES,
+    Manifest,
+    read_shard,
+    shard_file,
+    shard_path,
+)
 from tint_sumo.dataset.shards import (
     EPISODE_STEPS,
     ShardContents,
@@ -74,7 +83,7 @@ def record(
     workers: Workers = 1,
     fcd: bool = False,
     progress: bool = True,
-) -> dict[str, Any]:
+) -> Manifest:
     """Record a dataset of at least ``windows`` windows into ``out``, a folder or a URL, and return its manifest.
 
     The same call resumes an interrupted recording; a finished one is left as it is. With ``fcd`` the trajectories are

@@ -6,18 +6,23 @@ for, tells the trajectories once more, as SUMO does.
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from tint_sumo.config import NO_LEADER_GAP_M, WINDOW_STEPS, DriverProfile, Share, TrafficSeed, read_population
 from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import read_json
+from tint_sumo.core.ranges import Range
 from tint_sumo.core.reading import TABLE_BYTES, require_file
+from tint_sumo.core.structures import FieldError, build, is_required, plain
 
 SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"
@@ -26,7 +31,7 @@ DRIVERS = "drivers"
 TABLES = (TRAJECTORIES, DRIVERS)
 FCD = "fcd"
 _SUFFIX = {TRAJECTORIES: "parquet", DRIVERS: "parquet", FCD: "xml.gz"}
-_ROWS_KEY = {TRAJECTORIES: "rows", DRIVERS: "drivers"}  # names of a table's number of rows in the manifest
+_Count = Annotated[int, Range(0, 10**12)]
 
 
 def _field(name: str, dtype: pa.DataType, unit: str, meaning: str, nullable: bool = False) -> pa.Field:
@@ -63,6 +68,73 @@ DRIVER_SCHEMA = pa.schema(
 )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """Contents of a dataset and the settings that it was recorded with, in ``manifest.json``."""
+
+    kind: str = "dataset"
+    schema_version: int = SCHEMA_VERSION
+    scene: str
+    scene_digest: str
+    scene_settings: dict[str, Any] | None = None  # of a scene that differs from its base
+    windows: _Count
+    p_conservative: Share | None  # None: the traffic of a SUMO configuration
+    population: str | dict[str, Any] | tuple[str, ...]  # name, profiles, or the vTypes of a SUMO configuration
+    seed: TrafficSeed
+    window_steps: int = WINDOW_STEPS
+    no_leader_gap_m: float = NO_LEADER_GAP_M
+    rows: _Count
+    drivers: _Count
+    shards: Annotated[int, Range(0, 1_000_000)]
+    versions: dict[str, str] | None = None
+    sha256: dict[str, str] | None = None  # of the tables' files
+    windows_asked_for: _Count | None = None
+    episodes: _Count | None = None
+    episode_s: float | None = None
+
+    @property
+    def profiles(self) -> tuple[DriverProfile, ...] | None:
+        """The profiles of a scene's drivers; None for the vTypes of a SUMO configuration."""
+        if isinstance(self.population, tuple):
+            return None
+        return read_population(self.population, ("population",)).profiles
+
+    @property
+    def traits(self) -> tuple[str, ...]:
+        """The drivers' labels by their numbers: names of profiles or vTypes."""
+        return tuple(self.population) if self.profiles is None else tuple(profile.name for profile in self.profiles)
+
+    def content(self) -> dict[str, Any]:
+        """Return what the file contains: all fields but optional ones without a value."""
+        values = {field.name: plain(getattr(self, field.name)) for field in fields(self)}
+        return {
+            field.name: values[field.name]
+            for field in fields(self)
+            if values[field.name] is not None or is_required(field)
+        }
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Return the manifest of a dataset; entries that this version does not know are left out.
+
+    Raises:
+        InputError: there is none, it is damaged, or the dataset has another schema version.
+    """
+    found = read_json(folder / MANIFEST, "dataset")
+    version = found.get("schema_version")
+    if version != SCHEMA_VERSION:
+        raise InputError(
+            f"{folder} has dataset schema version {version}, this tint_sumo reads {SCHEMA_VERSION}; record it anew"
+        )
+    try:
+        manifest: Manifest = build(
+            Manifest, {field.name: found[field.name] for field in fields(Manifest) if field.name in found}
+        )
+    except FieldError as error:
+        raise InputError(f"{folder / MANIFEST} is damaged ({error}); record the dataset anew") from None
+    return manifest
+
+
 def shard_path(part: str, shard: int) -> str:
     """A shard's file, relative to the dataset's folder."""
     return f"{part}/shard-{shard:05d}.{_SUFFIX[part]}"
@@ -78,15 +150,15 @@ def shard_number(file: PurePath) -> int:
 
 
 def read_shards(
-    folder: Path, part: str, manifest: Mapping[str, Any], columns: list[str] | None = None
+    folder: Path, part: str, manifest: Manifest, columns: list[str] | None = None
 ) -> Iterator[pd.DataFrame]:
     """The rows of a dataset's table, shard after shard.
 
     Raises:
         InputError: a file is missing or damaged, or there are more or fewer rows than the manifest tells of.
     """
-    found, wanted = 0, manifest[_ROWS_KEY[part]]
-    for shard in range(manifest["shards"]):
+    found, wanted = 0, manifest.rows if part == TRAJECTORIES else manifest.drivers
+    for shard in range(manifest.shards):
         rows = read_shard(shard_file(folder, part, shard), columns)
         found += len(rows)
         yield rows
@@ -119,7 +191,7 @@ def _require_numbers(file: Path, rows: pd.DataFrame) -> None:
             raise InputError(f"{file} has values in {field.name} that are not finite; record the dataset anew")
 
 
-def verify(folder: Path, manifest: Mapping[str, Any]) -> int:
+def verify(folder: Path, manifest: Manifest) -> int:
     """Compare the files of a dataset with the checksums in its manifest.
 
     Returns:
@@ -128,17 +200,17 @@ def verify(folder: Path, manifest: Mapping[str, Any]) -> int:
     Raises:
         InputError: a file is missing or another one, or the manifest has no checksums.
     """
-    checksums = manifest.get("sha256")
+    checksums = manifest.sha256
     if not checksums:
         raise InputError(f"{folder / MANIFEST} has no checksums (an earlier version recorded it); record it anew")
-    for shard in range(manifest["shards"]):
+    for shard in range(manifest.shards):
         for table in TABLES:
             file = shard_file(folder, table, shard)
             with _mendable(file), file.open("rb") as content:
                 digest = hashlib.file_digest(content, "sha256").hexdigest()
             if checksums.get(shard_path(table, shard)) != digest:
                 raise InputError(f"{file} is not as it was recorded; remove it and repeat the command that recorded it")
-    return len(TABLES) * int(manifest["shards"])
+    return len(TABLES) * manifest.shards
 
 
 def read_shard_metadata(file: Path) -> pq.FileMetaData:

@@ -32,12 +32,14 @@ from tint_sumo.dataset.schema import (
     TABLES,
     TRAJECTORIES,
     TRAJECTORY_SCHEMA,
+    Manifest,
+    read_manifest,
     read_shard_metadata,
     shard_file,
     shard_number,
     shard_path,
 )
-from tint_sumo.dataset.windows import count_windows, read_manifest
+from tint_sumo.dataset.windows import count_windows
 from tint_sumo.jobs import Executor, Work, Workers, executor_of
 
 EPISODE_STEPS = 500
@@ -74,8 +76,8 @@ def record_dataset(
     episode_s: float,
     workers: Workers = 1,
     progress: bool = True,
-) -> dict[str, Any]:
-    """Record shards into ``out`` until they hold enough windows, or go on with that; the dataset's manifest.
+) -> Manifest:
+    """Record shards into ``out`` until they hold enough windows, or go on with that; return the dataset's manifest.
 
     Args:
         out: a new folder, or the one of this very recording, or its URL: shards then go there from where they are
@@ -101,7 +103,7 @@ def record_dataset(
         work = _Stored(shards, store) if is_url(out) else shards
         found = _record(settings["windows"], work, executor, progress)
         _remove_shards_from(store, len(found))
-        manifest = {
+        content = {
             **settings,
             **_contents(found),
             "sha256": _checksums(store, len(found)),
@@ -109,17 +111,17 @@ def record_dataset(
             "episodes": len(found) * episodes_per_shard,
             "episode_s": episode_s,
         }
-        write_json(folder / MANIFEST, manifest)
-        return manifest
+        write_json(folder / MANIFEST, content)
+        return read_manifest(folder)
 
 
-def _finished(folder: Path, store: Store, shards: Work[ShardContents]) -> dict[str, Any] | None:
-    """The manifest of a complete dataset."""
+def _finished(folder: Path, store: Store, shards: Work[ShardContents]) -> Manifest | None:
+    """Return the manifest of a complete dataset."""
     if not (folder / MANIFEST).exists():
         return None
     manifest = read_manifest(folder)
     held = store.files()
-    wanted = (path for shard in range(manifest["shards"]) for path in shards.paths(shard))
+    wanted = (path for shard in range(manifest.shards) for path in shards.paths(shard))
     return manifest if all(path in held for path in wanted) else None
 
 

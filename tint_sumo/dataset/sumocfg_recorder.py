@@ -15,7 +15,7 @@ import pandas as pd
 
 from tint_sumo.config import STEP_S
 from tint_sumo.core.errors import InputError
-from tint_sumo.dataset.schema import SCHEMA_VERSION, TABLES, shard_path
+from tint_sumo.dataset.schema import SCHEMA_VERSION, TABLES, Manifest, shard_path
 from tint_sumo.dataset.shards import (
     EPISODE_STEPS,
     ShardContents,
@@ -57,7 +57,7 @@ class SumocfgRecording:
 
 def record_sumocfg(
     sumocfg: Path, out: str | Path, windows: int, *, seed: int = 0, workers: int = 1, progress: bool = True
-) -> dict[str, Any]:
+) -> Manifest:
     """Record at least ``windows`` windows of a configuration's traffic and return the manifest.
 
     They go into ``out``, a folder or a URL. The same call resumes an interrupted recording; a finished one is left as

@@ -1,12 +1,12 @@
 """Windows of up to 20 steps for learning traits, from a recorded dataset. Labels are loaded apart."""
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Annotated, Any, Protocol, Self
+from typing import Protocol, Self
 
 import numpy as np
 import pandas as pd
@@ -16,19 +16,11 @@ from tint_sumo.config import (
     MIN_WINDOW_STEPS,
     NO_LEADER_GAP_M,
     WINDOW_STEPS,
-    Population,
-    Share,
-    TrafficSeed,
-    read_population,
 )
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.files import read_json
-from tint_sumo.core.ranges import Range
-from tint_sumo.core.structures import FieldError, build
-from tint_sumo.dataset.schema import DRIVERS, MANIFEST, SCHEMA_VERSION, TRAJECTORIES, read_shards
+from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, read_manifest, read_shards
 
 _DRIVERS_PER_EPISODE = 100_000
-_Count = Annotated[int, Range(0, 10**12)]
 PART = 10_000  # windows that are worked on at a time
 
 
@@ -72,7 +64,7 @@ def load_windows(folder: Path) -> Windows:
     Raises:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
     """
-    count = read_manifest(folder)["windows"]
+    count = read_manifest(folder).windows
     whole = Windows(
         np.empty((count, WINDOW_STEPS, 2), np.float32),
         np.empty(count, np.int64),
@@ -95,7 +87,7 @@ def read_windows(folder: Path) -> Iterator[Windows]:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
     """
     manifest = read_manifest(folder)
-    missing = manifest["windows"]
+    missing = manifest.windows
     for rows in read_shards(folder, TRAJECTORIES, manifest, ["episode", "vehicle", "position_m", "gap_m"]):
         windows = cut_windows(  # rows are sorted by episode, vehicle and time
             _driver_numbers(rows), rows["episode"].to_numpy(), rows["position_m"].to_numpy(), rows["gap_m"].to_numpy()
@@ -184,21 +176,9 @@ def load_labels(folder: Path, windows: OfDrivers) -> NDArray[np.int64]:
     Raises:
         InputError: the labels are missing or do not belong to these windows.
     """
-    manifest = read_manifest(folder)
-    names = own_vtypes(manifest) or [profile.name for profile in drivers_of(manifest).profiles]
+    traits = read_manifest(folder).traits
     drivers, row = _drivers(folder, windows, ["trait"])
-    return pd.Index(names).get_indexer(pd.Index(drivers["trait"].astype(str))).astype(np.int64)[row]
-
-
-def own_vtypes(manifest: Mapping[str, Any]) -> list[str] | None:
-    """The vTypes of a dataset of one's own SUMO configuration; None for the drivers of a scene."""
-    population = manifest["population"]
-    return population if isinstance(population, list) else None
-
-
-def drivers_of(manifest: Mapping[str, Any]) -> Population:
-    """The population of a dataset of a scene."""
-    return read_population(manifest["population"], ("population",))
+    return pd.Index(traits).get_indexer(pd.Index(drivers["trait"].astype(str))).astype(np.int64)[row]
 
 
 def load_drivers(folder: Path, windows: OfDrivers, columns: Sequence[str]) -> pd.DataFrame:
@@ -230,41 +210,6 @@ def episodes_to_test(episode: NDArray[np.int64], test_fraction: float, seed: int
     """Which of these episodes, each named once or more often, are for tests."""
     episodes = np.unique(episode)
     return np.random.default_rng(seed).permutation(episodes)[: round(test_fraction * len(episodes))]
-
-
-@dataclass(frozen=True)
-class _Manifest:
-    """What a manifest must say; it says more, of which nothing is computed."""
-
-    rows: _Count
-    drivers: _Count
-    windows: _Count
-    shards: Annotated[int, Range(0, 1_000_000)]
-    seed: TrafficSeed
-    scene: str
-    scene_digest: str
-    p_conservative: Share | None
-    population: Any
-    sha256: dict[str, str] | None = None
-
-
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a dataset.
-
-    Raises:
-        InputError: there is none, it is damaged, or the dataset has another schema version.
-    """
-    manifest = read_json(folder / MANIFEST, "dataset")
-    found = manifest.get("schema_version")
-    if found != SCHEMA_VERSION:
-        raise InputError(
-            f"{folder} has dataset schema version {found}, this tint_sumo reads {SCHEMA_VERSION}; record it anew"
-        )
-    try:
-        build(_Manifest, {field.name: manifest[field.name] for field in fields(_Manifest) if field.name in manifest})
-    except FieldError as error:
-        raise InputError(f"{folder / MANIFEST} is damaged ({error}); record the dataset anew") from None
-    return manifest
 
 
 def _driver_numbers(rows: pd.DataFrame) -> NDArray[np.int64]:

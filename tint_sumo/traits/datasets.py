@@ -11,14 +11,12 @@ from tint_sumo import traits
 from tint_sumo.config import CONSERVATIVE_LABEL, LATENT_SIZE, TRAIT_BUDGETS, TraitSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Report, silent
+from tint_sumo.dataset.schema import read_manifest
 from tint_sumo.dataset.windows import (
     WindowFile,
     Windows,
-    drivers_of,
     load_labels,
     load_windows,
-    own_vtypes,
-    read_manifest,
     read_training_windows,
     split_by_episode,
     window_file,
@@ -149,8 +147,8 @@ def plot_traits(
         InputError: no usable dataset or model.
     """
     trained, windows, labels, seed = _load_for_test(data, model, noise_m, other_scene)
-    manifest = read_manifest(data)
-    if own_vtypes(manifest) or len(drivers_of(manifest).profiles) > 2:
+    profiles = read_manifest(data).profiles
+    if profiles is None or len(profiles) > 2:
         raise InputError(
             "the picture is of conservative and aggressive drivers, and these are of vTypes or other profiles; "
             "evaluate instead"
@@ -204,8 +202,8 @@ def require_used(method: str, settings: TraitSettings) -> None:
 
 def describe(data: Path) -> dict[str, Any]:
     """What a model's card says about the dataset it was trained on."""
-    manifest = read_manifest(data)
-    return {key: manifest[key] for key in ("scene", "scene_digest", "p_conservative", "population", "seed", "windows")}
+    content = read_manifest(data).content()
+    return {key: content[key] for key in ("scene", "scene_digest", "p_conservative", "population", "seed", "windows")}
 
 
 def _require_unseen(data: Path, model: str | Path) -> None:

@@ -31,7 +31,7 @@ def trait_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def small_training(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A configuration whose rollouts take a moment."""
+    """A configuration whose rollouts and films take a moment."""
     file = tmp_path_factory.mktemp("small") / "config.yaml"
-    file.write_text("budget: {n_envs: 8, n_steps: 16, n_minibatches: 2}\n")
+    file.write_text("scene: {time_limit_s: 1.0}\nbudget: {n_envs: 8, n_steps: 16, n_minibatches: 2}\n")
     return file

@@ -112,8 +112,10 @@ WRITERS = (
 )
 
 
-def words_of(argv: str, out: Path, dataset: Path) -> list[str]:
-    return [word.replace("OUT", str(out)) if word != "DATA" else str(dataset) for word in argv.split()]
+def words_of(argv: str, out: Path, dataset: Path, config: Path | None = None) -> list[str]:
+    for name, path in (("OUT", out), ("DATA", dataset), ("CONFIG", config)):
+        argv = argv.replace(name, str(path))
+    return argv.split()
 
 
 @pytest.mark.parametrize("argv", WRITERS)
@@ -148,13 +150,13 @@ def test_a_limit_of_file_sizes_is_an_error(argv: str, tmp_path: Path, dataset: P
         ("net --out OUT/net", 20_000),
         ("record --windows 3000 --out OUT/data", 300_000),
         ("dataset inspect DATA --figure OUT/figure.png", 8_000),
-        ("traits train --data DATA --out OUT/model", 20_000),
+        ("traits train --data DATA --config CONFIG/traits.yaml --out OUT/model", 20_000),
         ("traits plot --data DATA --model vae --out OUT/pictures", 8_000),
         ("traits infer --fcd DATA --model vae --out OUT/table.parquet", 0),
         ("traits infer --fcd DATA --model vae --out OUT/table.csv", 0),
-        ("policy train --method oracle --budget quick --steps 1 --out OUT/policy", 20_000),
-        ("render --model ttc --out OUT/film.gif", 20_000),
-        ("render --model ttc --out OUT/film.png", 20_000),
+        ("policy train --method oracle --config CONFIG/policy.yaml --steps 1 --out OUT/policy", 20_000),
+        ("render --model always_go --out OUT/film.gif", 20_000),
+        ("render --model always_go --out OUT/film.png", 20_000),
     ],
 )
 def test_a_disk_that_gets_full_leaves_whole_files_alone(
@@ -162,12 +164,15 @@ def test_a_disk_that_gets_full_leaves_whole_files_alone(
     left_bytes: int,
     disk: Path,
     dataset: Path,
+    tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(files, "MIN_ROOM_BYTES", 1)
     filler = fill(disk, left_bytes + 4096)
-    words = words_of(argv, disk, dataset)
+    (tmp_path / "traits.yaml").write_text("budget: {base: quick, epochs: 1}")
+    (tmp_path / "policy.yaml").write_text("budget: quick\nscene: {time_limit_s: 1.0}")  # films are short
+    words = words_of(argv, disk, dataset, tmp_path)
     assert main(words) == 1
     require_one_line(capfd.readouterr().err, f"{disk}")
     assert not list(disk.rglob("*.partial"))

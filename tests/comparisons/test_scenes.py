@@ -54,7 +54,7 @@ def test_a_model_of_another_scene_is_refused_unless_it_is_asked_for(
     model = tmp_path / "model"
     assert evaluate_traits(recordings["roundabout"], model)["windows"] > 0
     with pytest.raises(
-        InputError, match=r"was trained in scene roundabout, .* is of scene t_intersection; say --other"
+        InputError, match=r"was trained in scene roundabout, .* is of scene t_intersection; give `other_scene`"
     ):
         evaluate_traits(recordings["t_intersection"], model)
     assert evaluate_traits(recordings["t_intersection"], model, other_scene=True)["windows"] > 0

@@ -6,6 +6,7 @@ of how many windows the range is. ``traits train`` writes the range by itself.
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,7 +14,7 @@ from tint_sumo.core.files import shipped
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import load_windows
 from tint_sumo.traits.input_range import InputRange
-from tint_sumo.traits.storage import add_to_card
+from tint_sumo.traits.storage import add_to_card, read_card
 
 
 def main() -> None:
@@ -23,14 +24,15 @@ def main() -> None:
     asked = parser.parse_args()
     ranges: dict[str, dict[str, object]] = {}
     for weights in sorted(shipped("models").glob("*.safetensors")):
-        data = json.loads(weights.with_suffix(".json").read_text(encoding="utf-8"))["data"]
+        data = read_card(weights).data or {}
         settings = {key: data[key] for key in ("p_conservative", "population", "seed", "scene")}
         key = json.dumps(settings)
         if key not in ranges:
             with TemporaryDirectory() as folder:
                 record(Path(folder) / "data", asked.windows, workers=asked.workers, **settings)
                 windows = load_windows(Path(folder) / "data")
-            ranges[key] = InputRange.of(windows.parts()).to_card() | {"input_range_windows": len(windows)}
+            reach = asdict(InputRange.of(windows.parts()))
+            ranges[key] = {"input_range": reach, "input_range_windows": len(windows)}
         add_to_card(weights, ranges[key])
 
 

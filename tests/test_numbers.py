@@ -137,7 +137,7 @@ def test_what_trait_models_leave_open() -> None:
 
 def test_shipped_trait_models() -> None:
     page = _prose("docs/explanation/trait-models.md")
-    accuracy = {name: read_card(name)["accuracy_by_noise"] for name in traits.TRAIT_METHODS}
+    accuracy = {name: read_card(name).entries["accuracy_by_noise"] for name in traits.TRAIT_METHODS}
     assert f"right in {percent(accuracy['cross_window']['0'], 3)} % of the exact windows" in page
     fallen = [accuracy[name]["0.05"] for name in ("vae", "morton", "classifier")]
     assert f"fall to {percent(min(fallen))} to {percent(max(fallen))} % at 0.05 m" in page

@@ -118,7 +118,7 @@ def test_shipped_models_are_small_and_tell_unseen_drivers_apart(
 ) -> None:
     assert find(name).with_suffix(".safetensors").stat().st_size < 2_000_000
     assert evaluate_traits(dataset, name, noise_m=noise_m)["accuracy"] >= least
-    assert read_card(name)["accuracy_by_noise"][f"{noise_m:g}"] >= least
+    assert read_card(name).entries["accuracy_by_noise"][f"{noise_m:g}"] >= least
 
 
 def test_noise_makes_evaluation_harder_and_is_repeatable(dataset: Path) -> None:
@@ -152,7 +152,7 @@ def test_every_setting_of_a_training_is_used_or_refused(
     assert "method cross_window does not use kl_weight" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
     assert train({"noise_m": 0.5, "kl_weight": 1.0}) == 0
-    settings = read_card(tmp_path / "run")["settings"]
+    settings = read_card(tmp_path / "run").entries["settings"]
     assert (settings["noise_m"], settings["kl_weight"]) == (0.5, 1.0)
 
 

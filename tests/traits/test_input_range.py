@@ -1,13 +1,9 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tint_sumo.config import WINDOW_STEPS
-from tint_sumo.core.errors import InputError
-from tint_sumo.core.files import shipped
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.traits.input_range import MARGIN_M, InputRange
 from tint_sumo.traits.storage import read_card
@@ -53,23 +49,9 @@ def test_longer_windows_than_those_of_the_training_are_outside() -> None:
     assert [short.outside(windows_of(2.0, 3.0, length=length)).item() for length in (3, 4, 5)] == [False, False, True]
 
 
-def test_a_card_keeps_it() -> None:
-    whole = InputRange.of([windows_of(2.0, 3.0, length=7), windows_of(6.0, 10.0, length=3)])
-    assert InputRange.from_card(whole.to_card()) == whole
-    assert InputRange.from_card({}) is None
-
-
-@pytest.mark.parametrize("broken", [1, {}, {"low_gap_m": [0.0] * 20}, "short", "text"])
-def test_a_damaged_one_is_refused(broken: object) -> None:
-    steps = {"short": [0.0] * 19, "text": ["far"] * 20}.get(str(broken))
-    held = dict.fromkeys(("low_offset_m", "high_offset_m", "low_gap_m", "high_gap_m"), steps) if steps else broken
-    with pytest.raises(InputError, match=r"card of the trait model: input_range.*; restore the file"):
-        InputRange.from_card({"input_range": held})
-
-
 @pytest.mark.parametrize("name", ["vae", "cross_window", "morton", "classifier"])
 def test_shipped_models_know_theirs(name: str) -> None:
-    reach = InputRange.from_card(read_card(Path(shipped("models") / name)))
+    reach = read_card(name).input_range
     assert reach is not None
     assert not reach.outside(windows_of(2.5, 8.0)).any()
     assert reach.outside(windows_of(30.0, 8.0)).all()

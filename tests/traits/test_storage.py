@@ -1,11 +1,12 @@
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.traits import load, storage
+from tint_sumo.traits.input_range import InputRange
 from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.storage import add_to_card, read_card, save
 from tint_sumo.traits.vae import Vae
@@ -112,14 +113,14 @@ def test_a_card_that_does_not_fit_the_weights_is_reported(saved, small):
 @pytest.mark.parametrize("settings", [{"depth": 3}, {"embedding_sizes": [-1]}, {"hidden_size": "many"}])
 def test_settings_nobody_can_use_are_reported(saved, settings):
     add_directly(saved, {"settings": settings})
-    with pytest.raises(InputError, match="unusable settings"):
+    with pytest.raises(InputError, match="settings"):
         load(saved)
 
 
 def test_the_card_tells_what_it_was_given_and_takes_additions(saved):
     add_to_card(saved, {"accuracy": 0.99})
     card = read_card(saved)
-    assert (card["method"], card["latent_size"], card["seed"], card["accuracy"]) == ("vae", 2, 4, 0.99)
+    assert (card.method, card.latent_size, card.seed, card.entries["accuracy"]) == ("vae", 2, 4, 0.99)
     assert load(saved).latent_size == 2
 
 
@@ -129,3 +130,20 @@ def test_names_of_the_past_are_answered_with_those_of_today(old, new):
         load(old)
     with pytest.raises(InputError, match=f"^{old} is now called {new}; use that name$"):
         find_trait_method(old)
+
+
+def test_a_card_keeps_the_range_of_the_training_windows(saved, street):
+    windows, _ = street
+    reach = InputRange.of(windows.parts())
+    assert read_card(saved).input_range is None
+    add_to_card(saved, {"input_range": asdict(reach)})
+    assert read_card(saved).input_range == reach
+
+
+@pytest.mark.parametrize("broken", [1, {}, {"low_gap_m": [0.0] * 20}, "short", "text"])
+def test_a_damaged_range_is_refused(saved, broken):
+    steps = {"short": [0.0] * 19, "text": ["far"] * 20}.get(str(broken))
+    names = ("low_offset_m", "high_offset_m", "low_gap_m", "high_gap_m")
+    add_directly(saved, {"input_range": dict.fromkeys(names, steps) if steps else broken})
+    with pytest.raises(InputError, match=r"is not the card of a trait model \(input_range.*restore the file"):
+        load(saved)

@@ -79,7 +79,7 @@ def test_the_model_is_the_very_one_of_training_in_memory(data: Path, tmp_path: P
     for out, streaming in ((tmp_path / "memory", False), (tmp_path / "file", True)):
         train_traits(data, out, method=method, settings=settings, seed=1, streaming=streaming)
     assert files(tmp_path / "file") == files(tmp_path / "memory")
-    card = read_card(tmp_path / "file" / "model.safetensors")
+    card = read_card(tmp_path / "file" / "model.safetensors").entries
     assert card["windows"] == card["data"]["windows"] * 2 / 3
 
 

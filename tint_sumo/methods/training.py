@@ -130,7 +130,7 @@ def train_policy(
             raise InputError(f"{out} holds a finished run without {ZIP_FILE}; train into another folder to have one")
         if not card_file(stem).exists():
             if encoder is not None:
-                save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
+                save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)).entries)
             card = _card(identity, encoder)
             venv = training_venv(learned, encoder, p_conservative, settings, scene)
             try:
@@ -161,7 +161,7 @@ def share_training(source: Path, method: str, out: Path, traits: str | Path | No
     shared = read_policy_card(snapshot_stem(source, 100))
     training = {key: shared[key] for key in ("method", "p_conservative", "steps", "seed", "scene")}
     with claim_folder(out, {"kind": "policy", "method": method, "traits": digest(encoder), "training": training}):
-        save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)))
+        save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)).entries)
         for percent in (*SNAPSHOTS_PERCENT, 100):
             stem = snapshot_stem(source, percent)
             own = {"method": method, "trained_as": learned.trained_as} | _traits_entries(encoder)

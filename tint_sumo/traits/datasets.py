@@ -62,7 +62,7 @@ def train_traits(
             _train(data, windows, out, method=method, settings=settings, seed=seed, report=report)
     else:
         train_on_split(data, load_windows(data), out, method=method, settings=settings, seed=seed, report=report)
-    return read_card(out / "model.safetensors")
+    return read_card(out / "model.safetensors").entries
 
 
 def train_on_split(
@@ -173,7 +173,7 @@ def _load_for_test(
         require_scene(model, here["scene"], here["scene_digest"], str(data))
     _require_unseen(data, model)
     windows = load_windows(data)
-    return trained, windows, load_labels(data, windows), int(read_card(model).get("seed", 0))
+    return trained, windows, load_labels(data, windows), read_card(model).seed
 
 
 def first_of_two(labels: NDArray[np.int64], method: str) -> NDArray[np.bool_]:
@@ -211,7 +211,7 @@ def _require_unseen(data: Path, model: str | Path) -> None:
 
     Episodes follow from P and seed; a dataset of another size has them in common, but splits them otherwise.
     """
-    trained_on = read_card(model).get("data") or {}
+    trained_on = read_card(model).data or {}
     here = describe(data)
     alike = all(trained_on.get(key) == here[key] for key in ("scene", "p_conservative", "population", "seed"))
     if alike and trained_on.get("windows") != here["windows"]:

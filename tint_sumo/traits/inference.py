@@ -13,7 +13,6 @@ from tint_sumo.dataset.tracks import read_tracks
 from tint_sumo.dataset.windows import cut_windows, window_rows
 from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.evaluation import Latents, encode_windows
-from tint_sumo.traits.input_range import InputRange
 from tint_sumo.traits.storage import load, read_card
 from tint_sumo.traits.streaming import fuse_so_far
 
@@ -46,7 +45,7 @@ def infer_traits(
     Raises:
         InputError: unusable data, network, length or model.
     """
-    trained, reach = load(model), InputRange.from_card(read_card(model))
+    trained, reach = load(model), read_card(model).input_range
     rows = read_tracks(source, net_file=net_file, vehicle_length_m=vehicle_length_m)
     track = rows["track"].to_numpy()
     gap_m = rows["gap_m"].where(rows["gap_m"] < NO_LEADER_GAP_M).to_numpy()

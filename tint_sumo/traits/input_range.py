@@ -1,15 +1,14 @@
-"""What the windows of a model's training reach, and which other windows lie outside of it."""
+"""The range of a model's training windows, and which other windows lie outside of it."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.config import WINDOW_STEPS
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.structures import FieldError, build
 from tint_sumo.dataset.windows import Windows, valid_steps
 
 MARGIN_M = 0.1  # positions with two decimals, as SUMO writes them, are no other input
@@ -43,26 +42,6 @@ class InputRange:
         low, high = np.where(missing, 0.0, low), np.where(missing, -1.0, high)
         rounded = (np.round(one, 3).tolist() for one in (low[:, 0], high[:, 0], low[:, 1], high[:, 1]))
         return cls(*map(tuple, rounded))
-
-    @classmethod
-    def from_card(cls, card: Mapping[str, Any]) -> Self | None:
-        """Return the range that a model's card gives; None if it does not know it.
-
-        Raises:
-            InputError: what the card gives is no range.
-        """
-        given = card.get("input_range")
-        if given is None:
-            return None
-        try:
-            found: Self = build(cls, given, ("input_range",))
-        except FieldError as error:
-            raise InputError(f"the card of the trait model: {error}; restore the file") from None
-        return found
-
-    def to_card(self) -> dict[str, Any]:
-        """Return what a model's card says of it."""
-        return {"input_range": asdict(self)}
 
     def outside(self, windows: Windows) -> NDArray[np.bool_]:
         """Return which of N windows have a step whose offset or gap no training window had at that step, (N,)."""

@@ -1,7 +1,7 @@
-"""Trait models as files: NAME.safetensors with the weights and NAME.json, the card that says what they are."""
+"""Trait models as files: NAME.safetensors with the weights and NAME.json, the card that describes them."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,9 +12,26 @@ from tint_sumo.core.files import read_json, shipped, write_json
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import FieldError, build
 from tint_sumo.core.weights import read_weights, write_weights
+from tint_sumo.traits.input_range import InputRange
 from tint_sumo.traits.model import TRAIT_METHODS, TraitModel
 
 RUN_MODEL = "model"  # name of the model in the folder of a training run
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """Contents of a card: fields that the code uses, and all entries as they are."""
+
+    method: str
+    latent_size: LatentCount
+    settings: TraitSettings
+    data: dict[str, Any] | None = None  # the training dataset: scene, scene_digest, p_conservative, ...
+    seed: Annotated[int, Range(0, 2**64 - 1)] = 0
+    input_range: InputRange | None = None
+    entries: dict[str, Any] = field(default_factory=dict)
+
+
+_FIELDS = [one.name for one in fields(ModelCard) if one.name != "entries"]
 
 
 def save(model: TraitModel, stem: Path, card: Mapping[str, Any]) -> None:
@@ -29,7 +46,7 @@ def save(model: TraitModel, stem: Path, card: Mapping[str, Any]) -> None:
 
 
 def load(name_or_path: str | Path, latent_size: int | None = None) -> TraitModel:
-    """A trained model in evaluation mode, its weights frozen.
+    """Return a trained model in evaluation mode, its weights frozen.
 
     Args:
         name_or_path: name of a shipped model, folder of a training run, or path of a .safetensors file.
@@ -40,13 +57,13 @@ def load(name_or_path: str | Path, latent_size: int | None = None) -> TraitModel
             the latent size is another.
     """
     stem = find(name_or_path)
-    card = _checked_card(stem)
-    if latent_size is not None and card["latent_size"] != latent_size:
+    card = _read_card(stem)
+    if latent_size is not None and card.latent_size != latent_size:
         raise InputError(
-            f"trait model {name_or_path} has {card['latent_size']} latents where {latent_size} are needed; "
+            f"trait model {name_or_path} has {card.latent_size} latents where {latent_size} are needed; "
             "use a model trained with that latent size"
         )
-    weights = read_weights(_weights_file(stem), _card_file(stem), lambda: _build(card, stem), card)
+    weights = read_weights(_weights_file(stem), _card_file(stem), lambda: _build(card, stem), card.entries)
     model = _build(card, stem)
     try:
         model.load_state_dict(weights)
@@ -57,14 +74,21 @@ def load(name_or_path: str | Path, latent_size: int | None = None) -> TraitModel
     return model.eval().requires_grad_(False)
 
 
-def read_card(name_or_path: str | Path) -> dict[str, Any]:
-    """The card of a model, found as in ``load``."""
-    return _checked_card(find(name_or_path))
+def read_card(name_or_path: str | Path) -> ModelCard:
+    """Return the card of a model.
+
+    Args:
+        name_or_path: as in ``load``.
+
+    Raises:
+        InputError: there is no such model, or its card is damaged.
+    """
+    return _read_card(find(name_or_path))
 
 
 def require_scene(name_or_path: str | Path, scene: str, digest: str, user: str) -> None:
-    """Raise InputError if a model was trained in another scene than its user is of, or in another version of it."""
-    data = read_card(name_or_path).get("data") or {}
+    """Raise InputError if a model was trained in another scene than its user's, or in another version of it."""
+    data = read_card(name_or_path).data or {}
     if data.get("scene_digest", digest) != digest:
         raise InputError(
             f"trait model {name_or_path} was trained in scene {data.get('scene')}, {user} is of scene {scene}; "
@@ -73,13 +97,13 @@ def require_scene(name_or_path: str | Path, scene: str, digest: str, user: str) 
 
 
 def add_to_card(name_or_path: str | Path, entries: Mapping[str, Any]) -> None:
-    """Add what was found out about a saved model, such as its accuracy, to its card."""
+    """Add entries, such as an accuracy, to the card of a saved model."""
     stem = find(name_or_path)
-    write_json(_card_file(stem), {**_checked_card(stem), **entries})
+    write_json(_card_file(stem), {**_read_card(stem).entries, **entries})
 
 
 def find(name_or_path: str | Path) -> Path:
-    """The path of a model without its suffixes.
+    """Return the path of a model without its suffixes.
 
     Raises:
         InputError: there is no such model.
@@ -99,51 +123,31 @@ def find(name_or_path: str | Path) -> Path:
 
 def _is_trait_model(weights: Path) -> bool:
     try:
-        _checked_card(weights.with_suffix(""))
+        _read_card(weights.with_suffix(""))
     except InputError:
         return False
     return True
 
 
-@dataclass(frozen=True)
-class _Described:
-    """What a card must say of its model; it may say more."""
-
-    method: str
-    latent_size: LatentCount
-    settings: TraitSettings
-    data: dict[str, Any] | None = None
-    seed: Annotated[int, Range(0, 2**64 - 1)] = 0
-
-
-def _checked_card(stem: Path) -> dict[str, Any]:
-    card = read_json(_card_file(stem), "card of the trait model")
-    if str(card.get("method")) not in TRAIT_METHODS:
+def _read_card(stem: Path) -> ModelCard:
+    file = _card_file(stem)
+    entries = read_json(file, "card of the trait model")
+    mend = "restore the file or train the model again"
+    if str(entries.get("method")) not in TRAIT_METHODS:
         raise InputError(
-            f"{_card_file(stem)} is not the card of a trait model (methods: {', '.join(sorted(TRAIT_METHODS))}); "
-            "restore the file or train the model again"
+            f"{file} is not the card of a trait model (methods: {', '.join(sorted(TRAIT_METHODS))}); {mend}"
         )
-    _described(card, stem)
-    return card
-
-
-def _described(card: Mapping[str, Any], stem: Path) -> _Described:
     try:
-        known = {field.name: card[field.name] for field in fields(_Described) if field.name in card}
-        found: _Described = build(_Described, known)
+        card: ModelCard = build(ModelCard, {name: entries[name] for name in _FIELDS if name in entries})
     except FieldError as error:
-        raise InputError(
-            f"{_card_file(stem)} is not the card of a trait model: unusable settings ({error}); "
-            "restore the file or train the model again"
-        ) from None
-    return found
+        raise InputError(f"{file} is not the card of a trait model ({error}); {mend}") from None
+    return replace(card, entries=entries)
 
 
-def _build(card: Mapping[str, Any], stem: Path) -> TraitModel:
-    found = _described(card, stem)
+def _build(card: ModelCard, stem: Path) -> TraitModel:
     try:
         with preserved_random_state():
-            return TRAIT_METHODS[found.method](found.settings, found.latent_size)
+            return TRAIT_METHODS[card.method](card.settings, card.latent_size)
     except (TypeError, ValueError, RuntimeError, IndexError) as error:
         raise InputError(
             f"{_card_file(stem)}: unusable settings ({error}); restore the file or train the model again"

@@ -102,8 +102,8 @@ def train(
             loss = run.fit(out, report)
 
         known = {key: identity[key] for key in ("seed", "windows", "windows_sha256")}
-        reach = InputRange.of(windows.parts()).to_card()
-        save(model, out / RUN_MODEL, {**known, "loss": loss, **reach, **(card or {})})
+        reach = asdict(InputRange.of(windows.parts()))
+        save(model, out / RUN_MODEL, {**known, "loss": loss, "input_range": reach, **(card or {})})
         remove_checkpoint(out)
         return model.eval().requires_grad_(False)
 

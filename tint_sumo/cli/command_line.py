@@ -22,6 +22,7 @@ from tint_sumo.cli.net import Net
 from tint_sumo.cli.policy import Policy
 from tint_sumo.cli.render import Render
 from tint_sumo.cli.study import Study
+from tint_sumo.cli.tracks import Tracks
 from tint_sumo.cli.traits import Traits
 from tint_sumo.core.errors import BAD_PATHS, InputError, JobError, system_problem
 from tint_sumo.core.processes import end_quickly, interrupt_on_sigterm
@@ -48,6 +49,7 @@ class TintSumo:
         Annotated[Net, subcommand("net")]
         | Annotated[Record, subcommand("record")]
         | Annotated[Dataset, subcommand("dataset")]
+        | Annotated[Tracks, subcommand("tracks")]
         | Annotated[Traits, subcommand("traits")]
         | Annotated[Policy, subcommand("policy")]
         | Annotated[Study, subcommand("study")]

@@ -16,8 +16,9 @@ import gzip
 import zlib
 from array import array
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Literal, cast
+from typing import IO, Any, Literal, cast
 from xml.parsers import expat
 
 import numpy as np
@@ -32,15 +33,6 @@ from tint_sumo.scenes.layout import Layout
 
 EPISODE_PERIOD_S = 60.0
 VEHICLE_TYPE = "DEFAULT_VEHTYPE"
-_NAMES = {  # names of the columns in SUMO's tables
-    "timestep_time": "time_s",
-    "vehicle_id": "vehicle",
-    "vehicle_lane": "lane",
-    "vehicle_pos": "pos_m",
-    "vehicle_speed": "speed_mps",
-}
-_NUMBERS = ["time_s", "pos_m", "speed_mps"]
-_IDS = ["vehicle", "lane"]
 _AGAIN = "write it again with sumo --fcd-output"
 _DECIMALS = 2  # SUMO's own precision
 _GZIP_LEVEL = 6
@@ -51,6 +43,26 @@ _HEADER = """<?xml version="1.0" encoding="UTF-8"?>
 <fcd-export xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" \
 xsi:noNamespaceSchemaLocation="http://sumo.dlr.de/xsd/fcd_file.xsd">
 """
+
+
+@dataclass(frozen=True)
+class FcdColumns:
+    """Columns to read, with SUMO's names of the vehicles' attributes in the order of the answer."""
+
+    numbers: Mapping[str, str]  # attribute: name of the column
+    ids: Mapping[str, str]
+
+    @property
+    def names(self) -> Mapping[str, str]:
+        """Names of the columns by those in SUMO's tables."""
+        attributes = {f"vehicle_{attribute}": name for attribute, name in {**self.ids, **self.numbers}.items()}
+        return {"timestep_time": "time_s", **attributes}
+
+
+ON_LANES = FcdColumns({"pos": "pos_m", "speed": "speed_mps"}, {"id": "vehicle", "lane": "lane"})
+POSES = FcdColumns(
+    {"x": "x", "y": "y", "angle": "angle_deg", "speed": "speed_mps"}, {"id": "vehicle", "type": "vehicle_class"}
+)
 
 
 def write_fcd(rows: pd.DataFrame, file: Path, layout: Layout) -> None:
@@ -127,8 +139,8 @@ def _decimals(values: NDArray[np.float64]) -> NDArray[np.object_]:
     return texts
 
 
-def read_fcd(file: Path) -> pd.DataFrame:
-    """Columns time_s, vehicle and lane (categories), pos_m (of the front, along the lane) and speed_mps.
+def read_fcd(file: Path, columns: FcdColumns = ON_LANES) -> pd.DataFrame:
+    """Return the columns time_s and those asked for; ids are categories, pos_m is that of the front along the lane.
 
     XML is read in a stream: memory grows by 40 bytes for each vehicle and timestep. Persons are left out.
 
@@ -138,7 +150,7 @@ def read_fcd(file: Path) -> pd.DataFrame:
     """
     require_file(file, "floating-car data", TABLE_BYTES)
     try:
-        rows = _read_table(file) if {".csv", ".parquet"} & set(file.suffixes) else _read_xml(file)
+        rows = _read_table(file, columns) if {".csv", ".parquet"} & set(file.suffixes) else _read_xml(file, columns)
     except InputError:
         raise
     except expat.ExpatError as error:
@@ -147,27 +159,30 @@ def read_fcd(file: Path) -> pd.DataFrame:
         raise InputError(f"{file} is damaged ({str(error).splitlines()[0]}); {_AGAIN}") from None
     if rows.empty:
         raise InputError(f"{file} has no vehicles; write it again with traffic in it")
-    if rows.isna().any(axis=None) or np.isinf(rows[_NUMBERS]).any(axis=None):
-        raise InputError(f"{file} has a vehicle without time, lane, pos or speed; {_AGAIN}")
+    if rows.isna().any(axis=None) or np.isinf(rows.select_dtypes("number")).any(axis=None):
+        attributes = ", ".join([*columns.ids, *columns.numbers])
+        raise InputError(f"{file} has a vehicle without one of time, {attributes}; {_AGAIN}")
     return rows
 
 
-def _read_table(file: Path) -> pd.DataFrame:
+def _read_table(file: Path, columns: FcdColumns) -> pd.DataFrame:
+    names = columns.names
+    ids = {name: column for name, column in names.items() if column in columns.ids.values()}
     if file.suffix == ".parquet":
-        rows = pd.read_parquet(file, columns=list(_NAMES))
+        rows = pd.read_parquet(file, columns=list(names))
     else:
         with file.open("rb") as raw:
             packing: Literal["gzip"] | None = "gzip" if is_gzipped(raw) else None  # pandas knows others, too
-            ids = {"vehicle_id": str, "vehicle_lane": str}
-            rows = pd.read_csv(raw, sep=";", usecols=list(_NAMES), dtype=ids, compression=packing)
-    rows = rows.rename(columns=_NAMES)[list(_NAMES.values())]
+            texts = dict.fromkeys(ids, str)
+            rows = pd.read_csv(raw, sep=";", usecols=list(names), dtype=texts, compression=packing)
+    rows = rows.rename(columns=names)[list(names.values())]
     rows = rows[rows["vehicle"].notna()]  # an empty timestep is a row of its own
-    kinds = {**dict.fromkeys(_NUMBERS, "float64"), **dict.fromkeys(_IDS, "category")}
+    kinds = {name: "category" if name in ids.values() else "float64" for name in names.values()}
     return rows.astype(kinds).reset_index(drop=True)
 
 
-def _read_xml(file: Path) -> pd.DataFrame:
-    reader = _XmlReader(file)
+def _read_xml(file: Path, columns: FcdColumns) -> pd.DataFrame:
+    reader = _XmlReader(file, columns)
     with file.open("rb") as raw:
         reader.read(cast("IO[bytes]", gzip.GzipFile(fileobj=raw)) if is_gzipped(raw) else raw)
     return reader.rows()
@@ -176,25 +191,28 @@ def _read_xml(file: Path) -> pd.DataFrame:
 class _XmlReader:
     """Keeps numbers only; ids of vehicles and lanes once each."""
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, columns: FcdColumns) -> None:
         self._file = file
+        self._columns = columns
         self._parser = expat.ParserCreate()
         self._parser.StartElementHandler = self._check_root
         self._time_s = np.nan
-        self._numbers = {name: array("d") for name in _NUMBERS}
-        self._codes = {name: array("l") for name in _IDS}
-        self._ids: dict[str, dict[str, int]] = {name: {} for name in _IDS}
+        self._times_s = array("d")
+        self._numbers = {attribute: array("d") for attribute in columns.numbers}
+        self._codes = {attribute: array("l") for attribute in columns.ids}
+        self._ids: dict[str, dict[str, int]] = {attribute: {} for attribute in columns.ids}
 
     def read(self, stream: IO[bytes]) -> None:
         self._parser.ParseFile(stream)
 
     def rows(self) -> pd.DataFrame:
-        categories = {
-            name: pd.Categorical.from_codes(np.asarray(codes), pd.Index(list(self._ids[name]), dtype=object))
-            for name, codes in self._codes.items()
-        }
-        numbers = {name: np.asarray(values) for name, values in self._numbers.items()}
-        return pd.DataFrame({**numbers, **categories})[list(_NAMES.values())]
+        columns: dict[str, Any] = {"time_s": np.asarray(self._times_s)}
+        for attribute, name in self._columns.ids.items():
+            known = pd.Index(list(self._ids[attribute]), dtype=object)
+            columns[name] = pd.Categorical.from_codes(np.asarray(self._codes[attribute]), known)
+        for attribute, name in self._columns.numbers.items():
+            columns[name] = np.asarray(self._numbers[attribute])
+        return pd.DataFrame(columns)
 
     def _check_root(self, name: str, _: Mapping[str, str]) -> None:
         if name != "fcd-export":
@@ -215,12 +233,14 @@ class _XmlReader:
             raise InputError(f"{self._here()} is damaged ({error}); {_AGAIN}") from None
 
     def _append(self, attributes: Mapping[str, str]) -> None:
-        numbers = (self._time_s, float(attributes["pos"]), float(attributes["speed"]))
-        for name, number in zip(_NUMBERS, numbers, strict=True):
-            self._numbers[name].append(number)
-        for name, text in zip(_IDS, (attributes["id"], attributes["lane"]), strict=True):
-            ids = self._ids[name]
-            self._codes[name].append(ids.setdefault(text, len(ids)))
+        values = {attribute: float(attributes[attribute]) for attribute in self._numbers}
+        texts = {attribute: attributes[attribute] for attribute in self._codes}
+        self._times_s.append(self._time_s)
+        for attribute, value in values.items():
+            self._numbers[attribute].append(value)
+        for attribute, text in texts.items():
+            ids = self._ids[attribute]
+            self._codes[attribute].append(ids.setdefault(text, len(ids)))
 
     def _here(self) -> str:
         return f"{self._file}, line {self._parser.CurrentLineNumber}"

@@ -15,6 +15,7 @@ WRITING = {
     "net": "net --out OUT",
     "record": "record --windows 20 --out OUT",
     "dataset inspect": "dataset inspect DATA --figure OUT",
+    "tracks inspect": "tracks inspect DATA --figure OUT",
     "traits train": "traits train --data DATA --out OUT",
     "traits plot": "traits plot --data DATA --model vae --out OUT",
     "traits infer": "traits infer --fcd DATA --model vae --out OUT",
@@ -59,7 +60,14 @@ def test_every_command_that_writes_is_called() -> None:
 def test_a_run_is_not_written_into_by_others(name: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = contents(run)
     outs = [run / path for path in (*FILES, *FOLDERS)]
-    if name in ("net", "dataset inspect", "traits plot", "traits infer", "render"):  # others have homes of their own
+    if name in (
+        "net",
+        "dataset inspect",
+        "tracks inspect",
+        "traits plot",
+        "traits infer",
+        "render",
+    ):  # others have homes of their own
         outs += [run / "new.png", run / "new.csv", run / "new.gif", run / "new"]
     for out in outs:
         assert call(WRITING[name], out, run) == 2, out

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from pydoc import locate
 
 import pytest
 
@@ -18,6 +19,9 @@ DOCS = ROOT / "docs"
 FIRST_READ = [README, DOCS / "getting-started.md", DOCS / "reference" / "environments.md"]
 READ_LATER = [*sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("how-to/*.md"))]
 TYPED = [*FIRST_READ, *READ_LATER]
+NAMING = [README, ROOT / "CONTRIBUTING.md", ROOT / "data" / "README.md", *sorted(DOCS.rglob("*.md"))]
+_NAME = re.compile(r"\btint_sumo(?:\.[A-Za-z_]\w*)+")
+_PATH = re.compile(r"`((?:tint_sumo|tests|scripts|docs|examples|data|sumo_net)/[\w./*-]*)`")
 _FETCHED = re.compile(r"<(?:script|img|link rel=.stylesheet.)[^>]+(?:src|href)=.(https?://[^\"']+)")
 
 
@@ -103,6 +107,23 @@ def test_every_command_is_in_the_reference() -> None:
     shown = re.findall(r"^COLUMNS=100 (tint-sumo .*) --help$", reference, re.MULTILINE)
     assert sorted(shown) == sorted(f"tint-sumo {name}" for name, _ in commands())
     assert re.findall(r"^## (tint-sumo .*)$", reference, re.MULTILINE) == shown
+
+
+@pytest.mark.parametrize("page", NAMING, ids=lambda page: str(page.relative_to(ROOT)))
+def test_names_in_a_page_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert [name for name in set(_NAME.findall(text)) if locate(name) is None] == []
+    paths = [
+        path for path in set(_PATH.findall(text)) if path == path.lower()
+    ]  # others hold a placeholder or a version
+    assert [path for path in paths if not list(ROOT.glob(path.rstrip("/")))] == []
+
+
+def test_names_in_docstrings_exist() -> None:
+    texts = [file.read_text(encoding="utf-8") for file in (ROOT / "tint_sumo").rglob("*.py")]
+    names = {name for text in texts for name in re.findall(rf"``({_NAME.pattern})``", text)}
+    assert names
+    assert [name for name in names if locate(name) is None] == []
 
 
 def test_the_readme_is_short() -> None:

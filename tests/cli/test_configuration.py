@@ -304,9 +304,9 @@ def test_policies_and_films_of_other_drivers(
     message = "method oracle is told which of two kinds of drivers each one is of, and scene three has 3"
     assert message in refuse(capsys, "policy", "train", "--method", "oracle", "--config", file)
     run(capsys, "policy", "train", "--method", "no_labels", "--config", file)
-    assert "a film shows drivers of two profiles" in refuse(capsys, "render", "--model", "run", "--out", "film.png")
+    assert "a film needs drivers of 2 profiles" in refuse(capsys, "render", "--model", "run", "--out", "film.png")
     study = ("study", "run", "--config", written(tmp_path, scene), "--out", "study")
-    assert "a study is of two profiles of drivers, and scene three has 3" in refuse(capsys, *study)
+    assert "a study needs drivers of 2 profiles, and scene three has 3" in refuse(capsys, *study)
     assert not Path("study").exists()
 
 
@@ -336,10 +336,10 @@ def test_a_sumo_configuration_as_a_scene(
     assert "leave p_conservative out" in refuse(capsys, *argv)
     evaluation = ("policy", "evaluate", "--episodes", 1, "--model")
     assert "leave p_conservative and tau_s out" in refuse(capsys, *evaluation, "run", "--tau", 2)
-    assert "ttc needs the conflict zones" in refuse(capsys, *evaluation, "ttc", "--config", file)
-    assert "films show built-in scenes only" in refuse(capsys, "render", "--model", "run", "--out", "film.gif")
+    assert "ttc needs a built-in scene" in refuse(capsys, *evaluation, "ttc", "--config", file)
+    assert "a film needs a built-in scene" in refuse(capsys, "render", "--model", "run", "--out", "film.gif")
     assert "a study needs a built-in scene" in refuse(capsys, "study", "run", "--out", "study", "--config", file)
-    assert "scene merge has SUMO's files already" in refuse(capsys, "net", "--config", file)
+    assert "a network needs a built-in scene" in refuse(capsys, "net", "--config", file)
 
 
 def test_all_of_a_study_is_in_its_scene(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SCENES, T_INTERSECTION, EgoTask, Route, find_scene
 from tint_sumo.scenes.geometry import SPACING_M, Boxes, measure_distances_m, new_boxes, place
 from tint_sumo.scenes.layout import Layout, layout
-from tint_sumo.scenes.scene import register
+from tint_sumo.scenes.registry import register
 
 T = find_scene(T_INTERSECTION)
 LOWER, UPPER = 0, 1

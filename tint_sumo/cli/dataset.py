@@ -42,9 +42,9 @@ class Record(SpreadCommand):
     def run(self) -> Outcome:
         from tint_sumo.dataset.recorder import record
         from tint_sumo.dataset.sumocfg_recorder import record_sumocfg
-        from tint_sumo.scenes import SumocfgScene
+        from tint_sumo.scenes import find_scene
 
-        sumocfg = self.scene.config.file if isinstance(self.scene, SumocfgScene) else self.sumocfg
+        sumocfg = find_scene(self.scene).sumocfg or self.sumocfg
         if sumocfg is not None:
             self._require_nothing_but_the_configuration()
             manifest = record_sumocfg(sumocfg, self.out, self.windows, seed=self.seed, workers=self.workers)

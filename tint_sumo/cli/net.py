@@ -8,7 +8,6 @@ from tyro.conf import arg
 
 from tint_sumo.cli.command import Command, Outcome
 from tint_sumo.cli.values import SCENES, SceneValue
-from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import Range
 
 
@@ -23,12 +22,10 @@ class Net(Command):
     """Folder for the files; files of the same names are replaced if this command wrote them."""
 
     def run(self) -> Outcome:
-        from tint_sumo.scenes import Scene, find_scene
+        from tint_sumo.scenes import require_built_in
         from tint_sumo.scenes.build import CONFIG_FILE, write_scene
 
-        scene = find_scene(self.scene)
-        if not isinstance(scene, Scene):
-            raise InputError(f"scene {scene.name} has SUMO's files already")
+        scene = require_built_in("a network", self.scene)
         files = write_scene(self.out, scene, self.replicas)
         text = f"wrote {len(files)} files to {self.out}; run them with: sumo -c {self.out / CONFIG_FILE}"
         return Outcome(text, {"replicas": self.replicas, "files": [str(file) for file in files]})

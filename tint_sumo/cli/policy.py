@@ -51,13 +51,14 @@ class TrainPolicy(Command):
         from tint_sumo.jobs.status import Title
         from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.training import train_policy
-        from tint_sumo.scenes import SumocfgScene
+        from tint_sumo.scenes import ALL_SCENES, find_scene
 
         use_one_thread()
-        is_sumocfg = isinstance(self.scene, SumocfgScene) and self.p_conservative == TrainPolicy.p_conservative
+        is_given = self.p_conservative != TrainPolicy.p_conservative
+        has_mix = is_given or self.scene == ALL_SCENES or find_scene(self.scene).sumocfg is None
         settings = PPO_BUDGET.full(self.budget)
         steps = settings.total_steps if self.steps is None else self.steps
-        share = None if is_sumocfg else share_of(self.p_conservative)
+        share = share_of(self.p_conservative) if has_mix else None
         mix = "" if share is None else share_words(share)
         with one_job(Title("train", self.method, mix, self.seed)) as report:
             policy = train_policy(

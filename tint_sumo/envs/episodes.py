@@ -109,26 +109,11 @@ class TaskSettings:
     @cached_property
     def played(self) -> Scene | SumocfgScene:
         """The scene with these settings in place of its own."""
-        scene = find_scene(self.scene)
-        if isinstance(scene, SumocfgScene):
-            return self._sumocfg(scene)
-        population, traffic = scene.population, scene.traffic
-        if self.tau_s is not None:
-            population = replace(population, idm=replace(population.idm, tau_s=self.tau_s))
-        if self.p_conservative is not None:
-            traffic = replace(traffic, p_conservative=self.p_conservative)
-        return replace(scene, traffic=traffic, population=population, time_limit_s=self._time_limit_s(scene))
-
-    def _sumocfg(self, scene: SumocfgScene) -> SumocfgScene:
-        if self.p_conservative is not None or self.tau_s is not None:
-            raise InputError("the demand of a .sumocfg tells who drives how; leave p_conservative and tau_s out")
-        return replace(scene, time_limit_s=self._time_limit_s(scene))
-
-    def _time_limit_s(self, scene: Scene | SumocfgScene) -> float:
+        scene = find_scene(self.scene).with_drivers(self.p_conservative, self.tau_s)
         limit_s = scene.time_limit_s if self.time_limit_s is None else self.time_limit_s
-        if self.max_episode_steps is None:
-            return limit_s
-        return min(limit_s, self.max_episode_steps * self.steps_per_decision * scene.step_s)
+        if self.max_episode_steps is not None:
+            limit_s = min(limit_s, self.max_episode_steps * self.steps_per_decision * scene.step_s)
+        return replace(scene, time_limit_s=limit_s)
 
 
 def require_arguments(environment: type, task: Mapping[str, Any]) -> None:

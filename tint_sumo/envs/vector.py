@@ -37,7 +37,7 @@ from tint_sumo.envs.rows import (
     step_info,
 )
 from tint_sumo.envs.workers import WorkerBatch
-from tint_sumo.scenes import T_INTERSECTION, AnyScene, Scene, SumocfgScene
+from tint_sumo.scenes import T_INTERSECTION, AnyScene
 
 MOST_ENVS = 100_000  # environments of one vector: beyond, memory would run out before anything is said
 
@@ -80,7 +80,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         **task: Any,
     ) -> None:
         num_envs = checked_count("num_envs", num_envs, 1, MOST_ENVS)
-        if isinstance(scene, str | Scene | SumocfgScene):
+        if isinstance(scene, str) or not isinstance(scene, Sequence):
             count = 1 if workers is None else checked_count("workers", workers, 1, num_envs, "num_envs = ")
             scenes: Sequence[AnyScene] = [scene] * count
         elif workers in (None, len(scene)):

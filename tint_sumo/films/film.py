@@ -19,7 +19,7 @@ from tint_sumo.films.trait_probe import fit_reader
 from tint_sumo.methods.evaluation import CASES_PER_SEED, require_seed
 from tint_sumo.methods.loading import Contender
 from tint_sumo.methods.registry import look_of
-from tint_sumo.scenes import Scene, SumocfgScene, find_scene
+from tint_sumo.scenes import Scene, require_built_in
 from tint_sumo.scenes.layout import layout
 
 SUFFIXES = (".mp4", ".gif", ".png")
@@ -81,13 +81,7 @@ def render_case(
 
 def require_film_scene(contender: Contender) -> Scene:
     """The contender's scene; InputError unless a film can show it."""
-    scene = find_scene(contender.scene)
-    if isinstance(scene, SumocfgScene):
-        raise InputError(f"scene {scene.name} is a SUMO configuration; films show built-in scenes only")
-    count = len(scene.population.profiles)
-    if count != 2:
-        raise InputError(f"a film shows drivers of two profiles, and scene {scene.name} has {count}")
-    return scene
+    return require_built_in("a film", contender.scene, profiles=2)
 
 
 def require_film_file(out: Path) -> None:

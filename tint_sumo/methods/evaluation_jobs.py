@@ -19,7 +19,7 @@ from tint_sumo.jobs.jobs import THREADS_PER_JOB
 from tint_sumo.jobs.status import Title
 from tint_sumo.methods.evaluation import BATCH, Case, Evaluation, StoredCase, evaluate, require_cases
 from tint_sumo.methods.loading import Contender, load_policy
-from tint_sumo.scenes import AnyScene, SumocfgScene, find_scene
+from tint_sumo.scenes import AnyScene, find_scene
 
 MAX_CASES = 1000  # cases of a job: some 20 seconds' work is lost with a machine
 _MODEL = "model"  # folder of the policy's files
@@ -118,7 +118,7 @@ def evaluate_on(
         JobError: cases were given up.
     """
     require_cases(episodes, seed)
-    if isinstance(find_scene(contender.scene), SumocfgScene):
+    if find_scene(contender.scene).sumocfg:
         raise InputError("the .sumocfg of a scene is on this machine alone; evaluate here, not on a cluster")
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as folder:
         out = Path(folder)

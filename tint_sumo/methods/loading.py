@@ -20,7 +20,7 @@ from tint_sumo.methods.training import POLICY, TRAITS, digest
 from tint_sumo.policy import RecurrentPPO, TraitSource
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
 from tint_sumo.policy.wrappers import policy_venv
-from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, SumocfgScene, find_scene, read_described
+from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, find_scene, read_described
 from tint_sumo.traits import TraitModel
 
 DEFAULT_P_CONSERVATIVE = 0.4
@@ -45,8 +45,7 @@ class Contender:
     @property
     def tau_s(self) -> float | None:
         """Time headway of the scene's drivers; None in a SUMO configuration."""
-        scene = find_scene(self.scene)
-        return None if isinstance(scene, SumocfgScene) else scene.tau_s
+        return find_scene(self.scene).tau_s
 
     def make_venv(self, num_envs: int, **task: Any) -> VecEnv:
         """Environments with the observations the policy takes; ``task`` as in ``SceneEnv``.
@@ -55,7 +54,7 @@ class Contender:
         """
         source = None if self.source is None else self.source()
         place = task.get("scene", self.scene)
-        count = min(num_envs, os.cpu_count() or 1) if isinstance(place, SumocfgScene) else num_envs
+        count = min(num_envs, os.cpu_count() or 1) if find_scene(place).sumocfg else num_envs
         return policy_venv(count, source, action_repeat=self.action_repeat, **{"scene": place, **task})
 
 
@@ -110,7 +109,7 @@ def _in_scene(contender: Contender, scene: AnyScene) -> Contender:
         if wanted != there:
             raise InputError(f"policy {contender.name} needs {what} of {wanted}, and scene {found.name} has {there}")
     trained_for = DEFAULT_P_CONSERVATIVE if contender.p_conservative is None else contender.p_conservative
-    return replace(contender, scene=scene, p_conservative=None if isinstance(found, SumocfgScene) else trained_for)
+    return replace(contender, scene=scene, p_conservative=None if found.sumocfg else trained_for)
 
 
 def _require_same_roads(stem: Path, found: Contender) -> None:

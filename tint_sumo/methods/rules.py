@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.config import POSITION_SCALE_M, SPEED_SCALE_MPS
-from tint_sumo.core.errors import InputError
-from tint_sumo.scenes import T_INTERSECTION, AnyScene, SumocfgScene, find_scene
+from tint_sumo.scenes import T_INTERSECTION, AnyScene, require_built_in
 from tint_sumo.scenes.geometry import SPACING_M, Floats, along, as_line, new_boxes, place, project
 from tint_sumo.scenes.layout import Layout, layout
 
@@ -58,9 +57,7 @@ class TimeToCollision:
 
     @cached_property
     def _world(self) -> "_World":
-        scene = find_scene(self.scene)
-        if isinstance(scene, SumocfgScene):
-            raise InputError("ttc needs the conflict zones of a built-in scene; take another policy")
+        scene = require_built_in("ttc", self.scene)
         return _World(layout(scene))
 
     def predict(

@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits as trait_models
-from tint_sumo.config import LATENT_SIZE, SNAPSHOTS_PERCENT, PpoSettings, Share, ends, require_share
+from tint_sumo.config import LATENT_SIZE, SNAPSHOTS_PERCENT, PpoSettings, Share, ends
 from tint_sumo.core.checkpoints import remove_checkpoint, write_checkpoint
 from tint_sumo.core.determinism import preserved_random_state, single_threaded
 from tint_sumo.core.errors import DivergedError, InputError, NotFiniteError
@@ -33,7 +33,7 @@ from tint_sumo.methods.registry import Learned, find_learned
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
 from tint_sumo.policy.wrappers import policy_venv
-from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, SumocfgScene, described, find_scene
+from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, described, find_scene
 from tint_sumo.traits import TraitModel
 from tint_sumo.traits.storage import read_card, require_scene, save
 
@@ -172,13 +172,7 @@ def _require_drivers(learned: Learned, p_conservative: Share | None, scene: AnyS
     """Raise InputError unless a method can be trained among a scene's drivers, in such a mix."""
     played = T_INTERSECTION if scene == ALL_SCENES else scene
     found = find_scene(played)
-    if isinstance(found, SumocfgScene):
-        kinds = len(found.vtypes)
-        if p_conservative is not None:
-            raise InputError("the demand of a .sumocfg tells who drives how; leave p_conservative out")
-    else:
-        kinds = len(found.population.profiles)
-        require_share(found.traffic.p_conservative if p_conservative is None else p_conservative)
+    kinds = len(found.with_drivers(p_conservative, None).traits)
     if learned.sees_true_traits and kinds != 2:
         raise InputError(
             f"method {learned.name} is told which of two kinds of drivers each one is of, and scene {found.name} has "

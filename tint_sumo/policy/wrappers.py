@@ -14,7 +14,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy.trait_sources import Frame, Observation, OracleTraits, TraitSource
-from tint_sumo.scenes import SumocfgScene
+from tint_sumo.scenes import T_INTERSECTION, find_scene
 
 TRAITS, TRUE_TRAITS = "traits", "true_traits"
 _NEEDED = frozenset({"ego", "vehicles", "mask"})
@@ -156,8 +156,9 @@ def policy_venv(
         monitored: count steps and rewards of each episode for Stable-Baselines3's logger.
         task: as in ``tint_sumo.envs.scene_env.SceneEnv``.
     """
-    if isinstance(task.get("scene"), SumocfgScene):  # one simulation per process
-        task["scene"] = [task["scene"]] * num_envs
+    scene = task.get("scene", T_INTERSECTION)
+    if not isinstance(scene, list) and find_scene(scene).sumocfg:  # one simulation per process
+        task["scene"] = [scene] * num_envs
     venv: VecEnv = SceneVecEnv(num_envs, tracks=source is not None and source.needs_tracks, **task)
     if source is not None:
         venv = TraitObservation(venv, source)

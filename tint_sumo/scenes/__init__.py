@@ -4,18 +4,17 @@ from tint_sumo.scenes import four_way as four_way
 from tint_sumo.scenes import on_ramp as on_ramp
 from tint_sumo.scenes import roundabout as roundabout
 from tint_sumo.scenes import t_intersection as t_intersection
-from tint_sumo.scenes.scene import (
+from tint_sumo.scenes.registry import (
     ALL_SCENES,
     SCENES,
     T_INTERSECTION,
-    EgoTask,
-    Route,
-    Scene,
-    View,
+    AnyScene,
     digest_of,
     find_scene,
+    require_built_in,
 )
-from tint_sumo.scenes.settings import AnyScene, described, read_described, read_scene, scene_settings
+from tint_sumo.scenes.scene import EgoTask, Route, Scene, View
+from tint_sumo.scenes.settings import described, read_described, read_scene, scene_settings
 from tint_sumo.scenes.sumocfg import SumocfgScene, from_sumocfg
 
 __all__ = [
@@ -34,5 +33,6 @@ __all__ = [
     "from_sumocfg",
     "read_described",
     "read_scene",
+    "require_built_in",
     "scene_settings",
 ]

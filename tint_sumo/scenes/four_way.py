@@ -5,7 +5,8 @@ from dataclasses import replace
 from tint_sumo.config import Claim
 from tint_sumo.scenes.network import Connection, Edge, Network, Node
 from tint_sumo.scenes.parts import AHEAD_ONLY, OVERHANG_M, arc
-from tint_sumo.scenes.scene import EgoTask, Route, Scene, View, register
+from tint_sumo.scenes.registry import register
+from tint_sumo.scenes.scene import EgoTask, Route, Scene, View
 
 _END_M, _MINOR_END_M = 20.0 + OVERHANG_M, 25.0
 _WEST_M, _EAST_M, _SOUTH_M, _NORTH_M = -4.0, 8.0, -4.0, 4.0  # borders of the junction

@@ -3,7 +3,8 @@
 from tint_sumo.config import Claim
 from tint_sumo.scenes.network import Connection, Edge, Network, Node, Point
 from tint_sumo.scenes.parts import AHEAD_ONLY, OVERHANG_M
-from tint_sumo.scenes.scene import EgoTask, Route, Scene, View, register
+from tint_sumo.scenes.registry import register
+from tint_sumo.scenes.scene import EgoTask, Route, Scene, View
 
 _END_M = 20.0 + OVERHANG_M
 _TAPER_START_M, _TAPER_END_M, _RAMP_Y_M = -8.0, 10.0, -4.0

@@ -9,7 +9,8 @@ import math
 from tint_sumo.config import Claim
 from tint_sumo.scenes.network import Connection, Edge, Network, Node, Point
 from tint_sumo.scenes.parts import AHEAD_ONLY, OVERHANG_M, arc, quarter_turns
-from tint_sumo.scenes.scene import EgoTask, Route, Scene, View, register
+from tint_sumo.scenes.registry import register
+from tint_sumo.scenes.scene import EgoTask, Route, Scene, View
 
 _RING_RADIUS_M = 11.0
 _ENTRY_RADIUS_M = 8.0

@@ -3,31 +3,27 @@
 A new scene is a file that makes one, and a line in ``tint_sumo/scenes/__init__.py``.
 """
 
-import hashlib
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cache
-from typing import TYPE_CHECKING, Any, overload
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import ClassVar
 
 from tint_sumo.config import (
     Claim,
     EgoController,
     Population,
+    Share,
     Slots,
     StepS,
     TimeS,
     Traffic,
     VehicleShape,
 )
-from tint_sumo.core.errors import InputError, find_named, shown
+from tint_sumo.core.errors import InputError, shown
 from tint_sumo.core.ranges import require_ranges
 from tint_sumo.scenes.digest import scene_digest
 from tint_sumo.scenes.network import Network, Point
-
-if TYPE_CHECKING:
-    from tint_sumo.scenes.sumocfg import SumocfgScene
 
 
 @dataclass(frozen=True)
@@ -86,6 +82,8 @@ class Scene:
     time_limit_s: TimeS = 50.0  # code
     base: str = ""  # name of the built-in scene that it is with other numbers
 
+    sumocfg: ClassVar[Path | None] = None  # the SUMO configuration whose traffic it has: none
+
     def __post_init__(self) -> None:
         if not 0.0 <= self.ego.start_m < self.ego.goal_m:
             start_m, goal_m = self.ego.start_m, self.ego.goal_m
@@ -123,6 +121,15 @@ class Scene:
         """Speed that no vehicle exceeds."""
         return self.network.speed_limit_mps
 
+    def with_drivers(self, p_conservative: Share | None, tau_s: float | None) -> "Scene":
+        """Return the scene with another mix and another time headway of its drivers, where they are given."""
+        population, traffic = self.population, self.traffic
+        if tau_s is not None:
+            population = replace(population, idm=replace(population.idm, tau_s=tau_s))
+        if p_conservative is not None:
+            traffic = replace(traffic, p_conservative=p_conservative)
+        return replace(self, traffic=traffic, population=population)
+
     @property
     def digest(self) -> str:
         """What tells the roads, the vehicles and the ego's task from others'; drivers and their mix do not count."""
@@ -135,48 +142,3 @@ def require_scene_name(name: str) -> None:
         raise InputError(
             f"name must be of up to 64 letters, digits, '_', '-' and '.', a letter first, not {shown(name)}"
         )
-
-
-T_INTERSECTION = "t_intersection"  # the paper's scene
-
-ALL_SCENES = "all"  # the scene's name for a policy that was trained in every scene at once
-
-SCENES: dict[str, Callable[[], Scene]] = {}
-
-
-def register(make: Callable[[], Scene]) -> Callable[[], Scene]:
-    """Make a scene known under the name of the function that makes it, which is called once.
-
-    Raises:
-        ValueError: the name is taken.
-    """
-    if make.__name__ in SCENES:
-        raise ValueError(f"two scenes are called {make.__name__!r}")
-    SCENES[make.__name__] = cache(make)
-    return make
-
-
-@overload
-def find_scene(scene: str | Scene) -> Scene: ...
-@overload
-def find_scene(scene: "str | Scene | SumocfgScene") -> "Scene | SumocfgScene": ...
-def find_scene(scene: Any) -> Any:
-    """The scene of a name; a scene itself is given back.
-
-    Raises:
-        InputError: there is none.
-    """
-    if not isinstance(scene, str):
-        return scene
-    return find_named("scene", scene, SCENES)()
-
-
-def digest_of(name: str) -> str:
-    """The digest of a scene, or of all scenes together.
-
-    Raises:
-        InputError: there is no such scene.
-    """
-    if name != ALL_SCENES:
-        return find_scene(name).digest
-    return hashlib.sha256("".join(make().digest for make in SCENES.values()).encode()).hexdigest()[:16]

@@ -32,11 +32,11 @@ from tint_sumo.core.structures import (
     require_base,
     require_known,
 )
-from tint_sumo.scenes.scene import ALL_SCENES, SCENES, T_INTERSECTION, Scene, digest_of, find_scene, require_scene_name
+from tint_sumo.scenes.registry import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, digest_of, find_scene
+from tint_sumo.scenes.scene import Scene, require_scene_name
 from tint_sumo.scenes.sumocfg import SumocfgScene, from_sumocfg
 
 RouteM = Annotated[float, Range(0.0, 1e6)]
-AnyScene = str | Scene | SumocfgScene
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def described(scene: AnyScene) -> dict[str, Any]:
     """What the settings and the card of a run say of its scene, or of all; ``read_described`` finds it again."""
     if isinstance(scene, str):
         return {"scene": scene, "scene_digest": digest_of(scene)}
-    changed = isinstance(scene, SumocfgScene) or scene.base
+    changed = scene.sumocfg or scene.base
     settings = {"scene_settings": plain(scene_settings(scene))} if changed else {}
     return {"scene": scene.name, "scene_digest": scene.digest, **settings}
 

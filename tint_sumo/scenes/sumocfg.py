@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 from xml.etree import ElementTree
 from xml.sax import SAXException
 
@@ -76,6 +76,7 @@ class SumocfgScene:
     up to ``sight_m`` away, the nearest ``max_vehicles`` of them.
     """
 
+    base: ClassVar[str] = ""  # no built-in scene with other numbers
     tau_s: ClassVar[None] = None  # the vTypes say it
     speed_limit_mps: ClassVar[float] = math.inf  # not known
 
@@ -97,6 +98,11 @@ class SumocfgScene:
         require_ranges(self)
 
     @property
+    def sumocfg(self) -> Path:
+        """The SUMO configuration whose traffic it has."""
+        return self.config.file
+
+    @property
     def traits(self) -> tuple[str, ...]:
         """Names of the drivers' traits: their vTypes; labels are their numbers."""
         return self.vtypes
@@ -105,6 +111,16 @@ class SumocfgScene:
     def trait_colours(self) -> tuple[tuple[int, ...], ...]:
         """Red, green and blue of each vType in pictures; the colours begin again after some."""
         return tuple(_COLOURS[number % len(_COLOURS)] for number in range(len(self.vtypes)))
+
+    def with_drivers(self, p_conservative: object, tau_s: object) -> Self:
+        """Return the scene.
+
+        Raises:
+            InputError: either is given, but the vTypes and the demand of the configuration say who drives.
+        """
+        if p_conservative is not None or tau_s is not None:
+            raise InputError("the demand of a .sumocfg says who drives how; leave p_conservative and tau_s out")
+        return self
 
     @property
     def step_s(self) -> float:

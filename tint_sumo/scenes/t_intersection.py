@@ -13,7 +13,8 @@ import numpy as np
 from tint_sumo.config import VehicleShape
 from tint_sumo.scenes.network import Connection, Edge, Network, Node, Point
 from tint_sumo.scenes.parts import mirrored_x
-from tint_sumo.scenes.scene import EgoTask, Route, Scene, View, register
+from tint_sumo.scenes.registry import register
+from tint_sumo.scenes.scene import EgoTask, Route, Scene, View
 
 _LENGTH_M = VehicleShape().length_m
 _HALF_LENGTH_M = 20.0  # the street's: vehicle centres lie in [-20, 20] (code)

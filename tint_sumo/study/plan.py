@@ -9,7 +9,7 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.methods.loading import shipped_policies
 from tint_sumo.methods.registry import Learned, find_learned, find_method, with_shared_trainings
-from tint_sumo.scenes import T_INTERSECTION, Scene, described, digest_of, find_scene
+from tint_sumo.scenes import T_INTERSECTION, Scene, described, digest_of, find_scene, require_built_in
 from tint_sumo.study.budgets import Budget
 from tint_sumo.study.ceiling_job import CeilingJob
 from tint_sumo.study.folders import DATASET
@@ -84,13 +84,7 @@ def require_scene(work: str, scene: str | Scene) -> Scene:
     Raises:
         InputError: it cannot.
     """
-    found = find_scene(scene)
-    if not isinstance(found, Scene):
-        raise InputError(f"{work} needs a built-in scene, or one with other numbers, not {found.name}")
-    count = len(found.population.profiles)
-    if count != 2:
-        raise InputError(f"{work} is of two profiles of drivers, and scene {found.name} has {count}")
-    return found
+    return require_built_in(work, scene, profiles=2)
 
 
 def _require_traits(budget: Budget, scene: Scene) -> None:

@@ -18,7 +18,7 @@ from tint_sumo.core.files import RUN_FILE, damaged, read_json, write_text
 from tint_sumo.jobs import Workers
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import read_versions
-from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION, Scene, SumocfgScene, read_described
+from tint_sumo.scenes import T_INTERSECTION, Scene, read_described, require_built_in
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.page.charts import Chart, curve_chart, outcome_chart, world_charts
 from tint_sumo.study.page.choosing import choose
@@ -89,12 +89,9 @@ def read_scene_of(out: Path) -> str | Scene:
     if "scene" not in settings:
         return T_INTERSECTION
     try:
-        scene = read_described(settings)
+        return require_built_in("a study", read_described(settings))
     except InputError as error:
         raise damaged(out / RUN_FILE, "run settings", error) from None
-    if isinstance(scene, SumocfgScene) or scene == ALL_SCENES:
-        raise damaged(out / RUN_FILE, "run settings", "scene: no study is of such scenes")
-    return scene
 
 
 def _page(study: _Study) -> str:

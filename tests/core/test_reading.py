@@ -9,7 +9,9 @@ import subprocess
 import sys
 import time
 import tracemalloc
+import zipfile
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ import pytest
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
-from tint_sumo.core.reading import open_file, read_file, require_file
+from tint_sumo.core.reading import open_file, read_file, require_file, require_zip
 from tint_sumo.dataset.fcd import read_fcd
 from tint_sumo.scenes.sumocfg import read_net
 
@@ -99,6 +101,16 @@ def test_a_gzip_bomb_is_refused_at_once(name: str, start: bytes, read: Callable[
     assert "\n" not in str(refused.value)
     assert time.process_time() - began < 1.0
     assert peak_bytes < 2**25
+
+
+def test_zip_files_are_refused_by_what_they_unpack_to(tmp_path: Path) -> None:
+    file = tmp_path / "thing.zip"
+    for count, most_bytes, is_refused in ((1, 2**16, False), (2, 2**16, True), (2**10, 2**30, True)):
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+            for number in range(count):
+                packed.writestr(str(number), bytes(2**16))
+        with pytest.raises(InputError, match=r"thing\.zip unpacks to more") if is_refused else nullcontext():
+            require_zip(file, "thing", most_bytes)
 
 
 @pytest.mark.slow

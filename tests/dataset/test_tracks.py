@@ -1,12 +1,16 @@
 """Floating-car data as tracks: hand-built scenes, damaged files, and what SUMO itself writes."""
 
 import gzip
+import random
 import subprocess
+import tracemalloc
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import sumo
 
@@ -151,7 +155,7 @@ def test_persons_are_left_out(tmp_path: Path) -> None:
             "lacks 'lane'",
         ),
         ("<fcd-export><timestep time='zero'/></fcd-export>", "line 1 is damaged"),
-        (fcd({0.0: [("a", "e_0", float("nan"), 1.0)]}), "without time, lane, pos or speed"),
+        (fcd({0.0: [("a", "e_0", float("nan"), 1.0)]}), "without one of time, id, lane, pos, speed"),
     ],
 )
 def test_what_is_no_floating_car_data_is_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -167,7 +171,7 @@ def test_a_table_without_a_column_or_a_value_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="vehicle_lane"):
         read_tracks(file)
     file.write_text(f"{names};vehicle_lane\n0.00;;;;\n0.10;a;;1.00;e_0\n")
-    with pytest.raises(InputError, match="without time, lane, pos or speed"):
+    with pytest.raises(InputError, match="without one of time, id, lane, pos, speed"):
         read_tracks(file)
 
 
@@ -177,6 +181,38 @@ def test_damaged_files_of_all_formats_are_refused(tmp_path: Path, name: str, con
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=name):
         read_tracks(tmp_path / name)
+
+
+def fcd_table(rows: int, vehicle: str) -> pa.Table:
+    ids = pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int8)), [vehicle])
+    numbers = dict.fromkeys(("timestep_time", "vehicle_pos", "vehicle_speed"), np.zeros(rows))
+    return pa.table({**numbers, "vehicle_id": ids, "vehicle_lane": ids})
+
+
+def test_a_table_of_absurdly_many_rows_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    """10,000,000 equal rows take 200 kB in the file and 400 MB in memory."""
+    pq.write_table(fcd_table(10_000_000, "a"), tmp_path / "fcd.parquet", compression="zstd")
+    assert (tmp_path / "fcd.parquet").stat().st_size < 300_000
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"fcd\.parquet unpacks to more than .* or 200 times its size"):
+        read_tracks(tmp_path / "fcd.parquet")
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 2**20
+
+
+def test_a_long_name_is_in_memory_once_however_many_rows_have_it(tmp_path: Path) -> None:
+    """A name of 1 MB in each of 1,000 rows, as vehicle and as lane, would be 2 GB."""
+    name = "".join(random.Random(0).choices("0123456789abcdef", k=2**20))
+    pq.write_table(fcd_table(1_000, name), tmp_path / "fcd.parquet", store_schema=False)
+    usual = pa.default_memory_pool()
+    pool = pa.proxy_memory_pool(usual)
+    pa.set_memory_pool(pool)
+    try:
+        assert read_fcd(tmp_path / "fcd.parquet")["vehicle"].cat.categories.tolist() == [name]
+    finally:
+        pa.set_memory_pool(usual)
+    assert 2**20 < pool.max_memory() < 2**25
 
 
 def test_a_network_must_be_that_of_the_data(tmp_path: Path) -> None:

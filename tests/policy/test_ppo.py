@@ -1,4 +1,5 @@
 import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -305,6 +306,14 @@ def test_missing_or_damaged_file_is_refused(content: bytes | None, tmp_path: Pat
         path.write_bytes(content)
     with pytest.raises(InputError, match=r"model\.zip"):
         RecurrentPPO.load(path)
+
+
+@pytest.mark.parametrize("name", ["model.zip", "model"])  # Stable-Baselines3 adds the suffix
+def test_a_file_that_unpacks_to_absurdly_much_is_refused_before_it_is_read(name: str, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "model.zip", "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("data", bytes(2**26))
+    with pytest.raises(InputError, match=r"policy: .*model\.zip unpacks to more than .* or 200 times its size"):
+        RecurrentPPO.load(tmp_path / name)
 
 
 def test_file_cut_short_is_refused(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ Pipes and devices would keep a command waiting, or never end.
 import gzip
 import os
 import stat
+import zipfile
 import zlib
 from pathlib import Path
 from typing import IO
@@ -17,7 +18,7 @@ JSON_BYTES = 2**24  # of cards, manifests and settings of runs
 RESULT_BYTES = 2**28  # of results, and of episodes that were recorded for a report
 WEIGHTS_BYTES = 2**30  # of the weights of one network
 TABLE_BYTES = 2**36  # of trajectories, networks and demand
-MOST_RATIO = 200  # of a gzipped file's content to its size; gzip can reach 1032, SUMO's files do not come near it
+MOST_RATIO = 200  # of a packed file's content to its size; gzip can reach 1032, SUMO's files do not come near it
 _SMALL_BYTES = 2**25  # content that may have any ratio
 _CHUNK_BYTES = 2**20
 
@@ -58,10 +59,35 @@ def require_file(path: Path, what: str, most_bytes: int) -> None:
     """
     with open_file(path, what, most_bytes) as file:
         if is_gzipped(file) and not _unpacks_within(file, most_bytes):
-            raise InputError(
-                f"{what}: {path} unpacks to more than {most_bytes:,} bytes or {MOST_RATIO} times its size, "
-                "as no such file does; check the path"
-            )
+            raise _unpacks_to_too_much(path, what, most_bytes)
+
+
+def require_zip(path: Path, what: str, most_bytes: int) -> None:
+    """Check a zip file for libraries that open it by its path.
+
+    Raises:
+        InputError: as in ``open_file``; or the file unpacks to too much.
+        zipfile.BadZipFile: it is not a zip file.
+    """
+    with open_file(path, what, most_bytes) as file, zipfile.ZipFile(file) as packed:
+        require_unpacked_bytes(path, what, most_bytes, sum(entry.file_size for entry in packed.infolist()))
+
+
+def require_unpacked_bytes(path: Path, what: str, most_bytes: int, unpacked_bytes: int) -> None:
+    """Raise InputError if a file with so much content, as the file itself has it, unpacks to too much."""
+    if unpacked_bytes > _most_unpacked(most_bytes, path.stat().st_size):
+        raise _unpacks_to_too_much(path, what, most_bytes)
+
+
+def _most_unpacked(most_bytes: int, packed_bytes: int) -> int:
+    return min(most_bytes, max(_SMALL_BYTES, MOST_RATIO * packed_bytes))
+
+
+def _unpacks_to_too_much(path: Path, what: str, most_bytes: int) -> InputError:
+    return InputError(
+        f"{what}: {path} unpacks to more than {most_bytes:,} bytes or {MOST_RATIO} times its size, "
+        "as no such file does; check the path"
+    )
 
 
 def is_gzipped(file: IO[bytes]) -> bool:
@@ -78,7 +104,7 @@ def _unpacks_within(file: IO[bytes], most_bytes: int) -> bool:
         try:
             while chunk := stream.read(_CHUNK_BYTES):
                 unpacked += len(chunk)
-                if unpacked > min(most_bytes, max(_SMALL_BYTES, MOST_RATIO * file.tell())):
+                if unpacked > _most_unpacked(most_bytes, file.tell()):
                     return False
         except (EOFError, OSError, zlib.error):
             pass

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import whole_file
 from tint_sumo.core.reading import TABLE_BYTES, is_gzipped, require_file
+from tint_sumo.dataset.schema import require_table
 from tint_sumo.scenes.geometry import new_boxes, place
 from tint_sumo.scenes.layout import Layout
 
@@ -169,7 +170,9 @@ def _read_table(file: Path, columns: FcdColumns) -> pd.DataFrame:
     names = columns.names
     ids = {name: column for name, column in names.items() if column in columns.ids.values()}
     if file.suffix == ".parquet":
-        rows = pd.read_parquet(file, columns=list(names))
+        require_table(file, "floating-car data")
+        rows = pd.read_parquet(file, columns=list(names), read_dictionary=list(ids))  # texts once each
+        rows = rows.astype(dict.fromkeys(ids, object))
     else:
         with file.open("rb") as raw:
             packing: Literal["gzip"] | None = "gzip" if is_gzipped(raw) else None  # pandas knows others, too

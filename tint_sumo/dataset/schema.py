@@ -21,7 +21,7 @@ from tint_sumo.config import NO_LEADER_GAP_M, WINDOW_STEPS, DriverProfile, Share
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_json
 from tint_sumo.core.ranges import Range
-from tint_sumo.core.reading import TABLE_BYTES, require_file
+from tint_sumo.core.reading import TABLE_BYTES, require_file, require_unpacked_bytes
 from tint_sumo.core.structures import FieldError, build, is_required, plain
 
 SCHEMA_VERSION = 2
@@ -173,7 +173,7 @@ def read_shard(file: Path, columns: list[str] | None = None) -> pd.DataFrame:
         InputError: the file is missing or damaged.
     """
     with _mendable(file):
-        rows = pd.read_parquet(file, columns=columns)
+        rows = pd.read_parquet(file, columns=columns, read_dictionary=["route", "trait"])  # texts once each
     _require_numbers(file, rows)
     return rows
 
@@ -223,12 +223,29 @@ def read_shard_metadata(file: Path) -> pq.FileMetaData:
         return pq.read_metadata(file)
 
 
+def require_table(file: Path, what: str) -> None:
+    """Check a Parquet file before all of it is read into memory.
+
+    Raises:
+        InputError: it is no regular file, or has absurdly more rows or bytes, as its metadata say, than its size.
+        ValueError or OSError: it is damaged.
+    """
+    require_file(file, what, TABLE_BYTES)
+    metadata = pq.read_metadata(file)
+    groups = (metadata.row_group(index) for index in range(metadata.num_row_groups))
+    encoded_bytes = sum(group.total_byte_size for group in groups)
+    numbers_bytes = metadata.num_rows * metadata.num_columns * np.dtype(np.float64).itemsize
+    require_unpacked_bytes(file, what, TABLE_BYTES, encoded_bytes + numbers_bytes)
+
+
 @contextmanager
 def _mendable(file: Path) -> Iterator[None]:
-    for one in file.glob("shard-*.parquet") if file.is_dir() else [file] if file.exists() else []:
-        require_file(one, "shard of a dataset", TABLE_BYTES)
     try:
+        for one in file.glob("shard-*.parquet") if file.is_dir() else [file] if file.exists() else []:
+            require_table(one, "shard of a dataset")
         yield
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{file} is missing; repeat the command that recorded the dataset") from None
     except (OSError, ValueError, KeyError) as error:  # pyarrow's own errors derive from these

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from tint_sumo.config import PpoSettings
 from tint_sumo.core.errors import DivergedError, InputError
 from tint_sumo.core.files import whole_file
+from tint_sumo.core.reading import WEIGHTS_BYTES, require_zip
 from tint_sumo.policy.buffer import SequenceBuffer, Sequences, buffer_class
 from tint_sumo.policy.loss import Decisions, ppo_loss
 from tint_sumo.policy.network import GruPolicy
@@ -303,9 +304,14 @@ class RecurrentPPO(OnPolicyAlgorithm):
         """Read a model back; arguments as in Stable-Baselines3. Only for files you trust: they are unpickled.
 
         Raises:
-            InputError: the file is missing or damaged, or ``env`` has other spaces than the model.
+            InputError: the file is missing, damaged or unpacks to too much, or ``env`` has other spaces than the model.
         """
         try:
+            if not isinstance(path, io.BufferedIOBase):
+                for file in (pathlib.Path(path), pathlib.Path(f"{path}.zip")):  # as Stable-Baselines3 looks for it
+                    if file.is_file():
+                        require_zip(file, "policy", WEIGHTS_BYTES)
+                        break
             return super().load(path, *args, **kwargs)
         except InputError:
             raise

@@ -23,6 +23,8 @@ from tint_sumo.dataset.tracks import read_tracks
 NET = shipped("sumo_net") / "tint.net.xml"
 Seen = tuple[str, str, float, float]  # vehicle, lane, pos, speed
 
+POOL = pa.proxy_memory_pool(pa.default_memory_pool())  # lives as long as what is allocated in it
+
 
 def fcd(steps: Mapping[float, Sequence[Seen]]) -> str:
     timesteps = (
@@ -204,15 +206,15 @@ def test_a_table_of_absurdly_many_rows_is_refused_before_it_is_read(tmp_path: Pa
 def test_a_long_name_is_in_memory_once_however_many_rows_have_it(tmp_path: Path) -> None:
     """A name of 1 MB in each of 1,000 rows, as vehicle and as lane, would be 2 GB."""
     name = "".join(random.Random(0).choices("0123456789abcdef", k=2**20))
-    pq.write_table(fcd_table(1_000, name), tmp_path / "fcd.parquet", store_schema=False)
+    file = tmp_path / "fcd.parquet"
+    pq.write_table(fcd_table(1_000, name), file, store_schema=False, dictionary_pagesize_limit=2**26)
     usual = pa.default_memory_pool()
-    pool = pa.proxy_memory_pool(usual)
-    pa.set_memory_pool(pool)
+    pa.set_memory_pool(POOL)
     try:
-        assert read_fcd(tmp_path / "fcd.parquet")["vehicle"].cat.categories.tolist() == [name]
+        assert read_fcd(file)["vehicle"].cat.categories.tolist() == [name]
     finally:
         pa.set_memory_pool(usual)
-    assert 2**20 < pool.max_memory() < 2**25
+    assert 2**20 < POOL.max_memory() < 2**25
 
 
 def test_a_network_must_be_that_of_the_data(tmp_path: Path) -> None:

@@ -171,8 +171,7 @@ def _read_table(file: Path, columns: FcdColumns) -> pd.DataFrame:
     ids = {name: column for name, column in names.items() if column in columns.ids.values()}
     if file.suffix == ".parquet":
         require_table(file, "floating-car data")
-        rows = pd.read_parquet(file, columns=list(names), read_dictionary=list(ids))  # texts once each
-        rows = rows.astype(dict.fromkeys(ids, object))
+        rows = pd.read_parquet(file, columns=list(names), read_dictionary=list(ids))  # ids once each
     else:
         with file.open("rb") as raw:
             packing: Literal["gzip"] | None = "gzip" if is_gzipped(raw) else None  # pandas knows others, too
@@ -181,7 +180,11 @@ def _read_table(file: Path, columns: FcdColumns) -> pd.DataFrame:
     rows = rows.rename(columns=names)[list(names.values())]
     rows = rows[rows["vehicle"].notna()]  # an empty timestep is a row of its own
     kinds = {name: "category" if name in ids.values() else "float64" for name in names.values()}
-    return rows.astype(kinds).reset_index(drop=True)
+    rows = rows.astype(kinds).reset_index(drop=True)
+    for name in ids.values():
+        column = rows[name].cat.remove_unused_categories()
+        rows[name] = column.cat.reorder_categories(sorted(column.cat.categories))
+    return rows
 
 
 def _read_xml(file: Path, columns: FcdColumns) -> pd.DataFrame:

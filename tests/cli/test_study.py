@@ -49,7 +49,7 @@ def test_study_report_names_its_files_as_the_user_does(
 
 def test_an_interrupted_study_leaves_whole_files(tmp_path: Path) -> None:
     out = tmp_path / "study"
-    printed = Started("study", "run", "--out", out).interrupt_at(r"record: +[1-9]", signal.SIGINT)
+    printed = Started("study", "run", "--out", out).interrupt_at(r"[1-9]\d*% ", signal.SIGINT)
     assert "Traceback" not in printed
     assert "the same command goes on from here" in printed
     assert not list(out.rglob("*.partial"))

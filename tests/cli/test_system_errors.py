@@ -1,6 +1,7 @@
 """What the system refuses ends a command in one line, and what was whole stays whole: real processes, full disks."""
 
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -32,8 +33,8 @@ def limit(kind: int, value: int) -> Callable[[], None]:
 
 
 def require_one_line(printed: str, problem: str) -> None:
-    """What a command has said on stderr, behind a progress bar if it showed one."""
-    lines = [line for line in printed.splitlines() if line and "%|" not in line and not line.endswith(": begins")]
+    """Check what a command has printed on stderr, beside the lines that its work begins and is done."""
+    lines = [line for line in printed.splitlines() if not re.search(r": (begins|done \(\d+ s\))$", line)]
     assert len(lines) == 1, printed
     assert lines[0].startswith("tint-sumo: error: ")
     assert problem in lines[0]

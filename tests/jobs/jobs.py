@@ -11,7 +11,6 @@ from tint_sumo.core.files import write_text
 from tint_sumo.core.processes import interrupt_on_sigterm
 from tint_sumo.core.progress import Progress, Report
 from tint_sumo.jobs import Local
-from tint_sumo.jobs.status import Title
 
 SAVING_S = 0.2  # longer than a signal takes that comes a second time
 GATE_S = 120.0  # a test that has failed opens no gate
@@ -45,10 +44,6 @@ class FileJob:
     def tries(self) -> int:
         """How often it was begun."""
         return int(self.path("tries").read_text()) if self.path("tries").exists() else 0
-
-    @property
-    def title(self) -> Title:
-        return Title(self.name)
 
     def is_done(self) -> bool:
         return self.path("done").exists()
@@ -94,10 +89,6 @@ class CountJob:
     needs = ()
     inputs = ()
     uses_gpu = False
-
-    @property
-    def title(self) -> Title:
-        return Title(self.name)
 
     @property
     def outputs(self) -> tuple[str, ...]:

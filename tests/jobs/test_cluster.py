@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -40,7 +41,7 @@ pytest.importorskip("ray", reason="Ray is not installed: pip install 'tint_sumo[
 
 from ray.cluster_utils import Cluster
 
-from tint_sumo.jobs.cluster import LOOK_INTERVAL_S, _versions, ray_cluster
+from tint_sumo.jobs.cluster import LOOK_INTERVAL_S, _FileStore, _versions, ray_cluster
 
 NODES = 3
 MANY_WINDOWS = 60_000  # some seconds' work
@@ -377,6 +378,41 @@ def test_a_command_uses_a_cluster_elsewhere(elsewhere: str, tmp_path: Path) -> N
 def test_no_cluster_at_an_address(address: str) -> None:
     with pytest.raises(InputError, match=f"^no Ray cluster answers at {address} .*; check `address`$"):
         ray_cluster(address).__enter__()
+
+
+@pytest.mark.parametrize("missing", ["ENABLE_RAY_CLUSTER", "ENABLE_RAY_CLUSTERS_ENV_VAR"])
+def test_a_ray_that_cannot_be_kept_on_this_machine_is_not_started(
+    missing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(f"ray._private.ray_constants.{missing}")
+    monkeypatch.setattr("ray.init", lambda *_, **__: pytest.fail("Ray has started"))
+    with pytest.raises(InputError, match=r"^Ray \S+ cannot be kept .*; install ray \S+, or .* give its `address`$"):
+        ray_cluster("local").__enter__()
+
+
+def test_the_object_store_holds_the_last_state_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held: weakref.WeakSet[Content] = weakref.WeakSet()
+
+    def put(content: bytes) -> Content:
+        held.add(found := Content(content))
+        return found
+
+    monkeypatch.setattr("ray.put", put)
+    store, file = _FileStore(), tmp_path / "file"
+    for state in range(3):
+        file.write_bytes(bytes([state]))
+        first = store.put(file, (state, 1))
+        assert store.put(file, (state, 1)) is first
+        assert first.content == bytes([state])
+        del first
+        assert len(held) == 1
+
+
+class Content:
+    """Stands for a reference to an object of Ray."""
+
+    def __init__(self, content: bytes) -> None:
+        self.content = content
 
 
 def test_a_share_of_a_gpu() -> None:

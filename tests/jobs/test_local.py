@@ -81,7 +81,7 @@ def test_jobs_that_would_wait_for_ever_are_refused(
 
 def test_jobs_with_the_same_name_are_refused(tmp_path: Path) -> None:
     jobs = [FileJob("same", tmp_path / "a"), FileJob("same", tmp_path / "b")]
-    with pytest.raises(InputError, match=r"^two jobs are called 'same'; give each its own name$"):
+    with pytest.raises(InputError, match=r"^two jobs are called 'same'; give each another name$"):
         Local(1).run(jobs)
 
 

@@ -14,11 +14,10 @@ from rich.console import Console
 
 from tests.terminal import look, open_terminal
 from tint_sumo.core.progress import Progress
-from tint_sumo.jobs.status import Overview, Standing, Title, duration
+from tint_sumo.jobs.status import Overview, Status, duration
 from tint_sumo.jobs.table import JobTable, Log, one_job, render
 
-TRAIN, OTHER = Title("train", "no_labels", "0.1 to 0.9", 0), Title("train", "ma", "0.4", 3)
-TRAITS = Title("traits", "vae")
+TRAIN, OTHER, TRAITS = "train no_labels-P0.1to0.9-seed0", "train ma-P0.4-seed3", "traits vae"
 PATIENCE_S = 60.0
 HIDE, SHOW = "\x1b[?25l", "\x1b[?25h"  # the cursor
 
@@ -32,19 +31,15 @@ class Clock:
         return self.now_s
 
 
-def half_done(title: Title, measures: dict[str, float]) -> Standing:
+def half_done(measures: dict[str, float]) -> Status:
     """Ten steps a second, and ten seconds left."""
-    standing = Standing(title, 0.0).after(Progress(0, 200, "step"), 0.0)
-    return standing.after(Progress(100, 200, "step", measures), 10.0)
+    return Status(0.0).after(Progress(0, 200, "step"), 0.0).after(Progress(100, 200, "step", measures), 10.0)
 
 
-def overview(*waiting: Title) -> Overview:
+def overview(*waiting: str) -> Overview:
     """One training and one trait model at work, one job done before."""
-    standings = {
-        TRAIN: half_done(TRAIN, {"success": 0.424, "collision": 0.12}),
-        TRAITS: half_done(TRAITS, {"loss": 0.01234}),
-    }
-    return Overview(3 + len(waiting), list(waiting), standings)
+    running = {TRAIN: half_done({"success": 0.424, "collision": 0.12}), TRAITS: half_done({"loss": 0.01234})}
+    return Overview(3 + len(waiting), list(waiting), running)
 
 
 def rendered(width: int) -> list[str]:
@@ -59,11 +54,9 @@ def rendered(width: int) -> list[str]:
 
 def test_a_wide_table_has_a_line_for_each_job_and_one_for_all() -> None:
     header, train, traits, whole = rendered(120)
-    assert header.split() == ["job", "method", "mix", "seed", "done", "speed", "left", "so", "far"]
-    assert re.fullmatch(
-        r"train +no_labels +0.1 to 0.9 +0 +━+\S* +50% +10 steps/s +10 s +success 42%, collision 12%", train
-    )
-    assert re.fullmatch(r"traits +vae +━+\S* +50% +10 steps/s +10 s +loss 0.0123", traits)
+    assert header.split() == ["job", "done", "speed", "left", "so", "far"]
+    assert re.fullmatch(rf"{TRAIN} +━+\S* +50% +10 steps/s +10 s +success 42%, collision 12%", train)
+    assert re.fullmatch(r"traits vae +━+\S* +50% +10 steps/s +10 s +loss 0.0123", traits)
     assert whole == "1 of 4 jobs are done, about 20 s left"
 
 
@@ -72,16 +65,16 @@ def test_a_narrow_table_has_two_lines_for_each_job_and_cuts_nothing_off() -> Non
     assert max(map(len, lines)) <= 60
     assert [re.split(r"  +", line) for line in lines] == [
         ["job", "done", "so far"],
-        ["train no_labels", "50%", "10 s left", "success 42%"],
-        ["mix 0.1 to 0.9, seed 0", "10 steps/s", "collision 12%"],
-        ["traits vae", "50%", "10 s left", "loss 0.0123"],
-        ["", "10 steps/s"],
+        ["train", "50%", "10 s left", "success 42%"],
+        ["no_labels-P0.1to0.9-seed0", "10 steps/s", "collision 12%"],
+        ["traits", "50%", "10 s left", "loss 0.0123"],
+        ["vae", "10 steps/s"],
         ["1 of 4 jobs are done, about 20 s left"],
     ]
 
 
 def test_speed_is_that_of_this_run_and_time_left_runs_down_between_reports() -> None:
-    resumed = Standing(TRAIN, 0.0).after(Progress(900, 1000, "step"), 5.0)
+    resumed = Status(0.0).after(Progress(900, 1000, "step"), 5.0)
     assert (resumed.speed, resumed.left_s(5.0)) == (0.0, None)
     resumed = resumed.after(Progress(920, 1000, "step"), 15.0)
     assert resumed.speed == pytest.approx(2.0)
@@ -93,7 +86,7 @@ def test_a_waiting_job_is_expected_to_take_as_long_as_others_of_its_task() -> No
     assert found.left_s(10.0) == pytest.approx((10.0 + 10.0 + 20.0) / 2)
     found.took_s["train"] = [120.0]
     assert found.left_s(10.0) == pytest.approx((10.0 + 10.0 + 70.0) / 2), "120 s and 20 s, of which 10 s are over"
-    assert Overview(2, [OTHER], {TRAIN: Standing(TRAIN, 0.0)}).left_s(10.0) is None
+    assert Overview(2, [OTHER], {TRAIN: Status(0.0)}).left_s(10.0) is None
 
 
 @pytest.mark.parametrize(
@@ -113,21 +106,21 @@ def test_a_log_has_a_line_for_each_begin_and_end_and_one_a_minute_for_all() -> N
     table.begin(TRAITS)
     for second in range(181):
         clock.now_s = second / 1.0
-        for title in (TRAIN, TRAITS):
-            table.report(title, Progress(second, 200, "step", {"success": 0.5}))
+        for name in (TRAIN, TRAITS):
+            table.report(name, Progress(second, 200, "step", {"success": 0.5}))
         table.refresh()
     table.end(TRAIN)
     table.end(TRAITS, "98% of windows told apart")
     lines = file.getvalue().splitlines()
-    assert lines[:2] == ["train no_labels, mix 0.1 to 0.9, seed 0: begins", "traits vae: begins"]
+    assert lines[:2] == [f"{TRAIN}: begins", "traits vae: begins"]
     assert len(lines) == 2 + 3 + 2
     assert lines[2] == (
         "1 of 3 jobs are done, about 2 min left; "
-        "train no_labels, mix 0.1 to 0.9, seed 0: 30%, 1 steps/s, 2 min left, success 50%; "
+        f"{TRAIN}: 30%, 1 steps/s, 2 min left, success 50%; "
         "traits vae: 30%, 1 steps/s, 2 min left, success 50%"
     )
     assert lines[-2:] == [
-        "train no_labels, mix 0.1 to 0.9, seed 0: success 50% (3 min)",
+        f"{TRAIN}: success 50% (3 min)",
         "traits vae: 98% of windows told apart (3 min)",
     ]
 
@@ -138,8 +131,8 @@ def test_a_pipe_gets_plain_lines(capsys: pytest.CaptureFixture[str], monkeypatch
         for done in range(500):
             report(Progress(done, 500, "step", {"success": 0.25}))
     begin, end = capsys.readouterr().err.splitlines()
-    assert begin == "train no_labels, mix 0.1 to 0.9, seed 0: begins"
-    assert end == "train no_labels, mix 0.1 to 0.9, seed 0: success 25% (0 s)"
+    assert begin == f"{TRAIN}: begins"
+    assert end == f"{TRAIN}: success 25% (0 s)"
 
 
 def test_a_single_job_shows_nothing_before_its_first_report(capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,10 +13,9 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.registry import Learned, find_method
 from tint_sumo.scenes import find_scene
-from tint_sumo.study import budgets
-from tint_sumo.study.budgets import BUDGETS, Budget, Conditions
+from tint_sumo.study.budgets import BUDGETS, Budget, Conditions, Trials
 from tint_sumo.study.ceiling_job import CeilingJob
-from tint_sumo.study.jobs import TrainJob
+from tint_sumo.study.jobs import EvaluateJob, TrainJob
 from tint_sumo.study.plan import plan, run_study
 from tint_sumo.study.results import read_results
 from tint_sumo.study.trait_job import TraitJob
@@ -38,7 +37,7 @@ def budget(brief: PpoSettings) -> Budget:
         methods=("always_go", "ma", "oracle"),
         mixes=(0.4,),
         seeds=(0,),
-        trials=(budgets.Trials((AT_MIX, HALF), 3), budgets.Trials((ELSEWHERE,), 2)),
+        trials=(Trials((AT_MIX, HALF), 3), Trials((ELSEWHERE,), 2)),
     )
 
 
@@ -54,12 +53,12 @@ def times(out: Path) -> dict[str, int]:
 
 
 def test_a_headway_that_is_the_scene_s_is_planned_like_one_that_is_not_given(tmp_path: Path) -> None:
-    given = tuple(budgets.Trials((Conditions(0.4, tau_s=tau_s),), 1) for tau_s in (1.0, 1.5))
+    given = tuple(Trials((Conditions(0.4, tau_s=tau_s),), 1) for tau_s in (1.0, 1.5))
     scene = find_scene("four_way")
     slow = replace(scene, name="slow", population=replace(scene.population, idm=Idm(tau_s=1.5)))
     jobs = plan(replace(BUDGETS["quick"], trials=given), tmp_path, slow)
-    planned = tuple(budgets.Trials((one,), 1) for one in (Conditions(0.4, tau_s=1.0), Conditions(0.4)))
-    tests = [job for job in jobs if isinstance(job, jobs.EvaluateJob | CeilingJob)]
+    planned = tuple(Trials((one,), 1) for one in (Conditions(0.4, tau_s=1.0), Conditions(0.4)))
+    tests = [job for job in jobs if isinstance(job, EvaluateJob | CeilingJob)]
     assert tests and all(job.trials == planned for job in tests)
 
 
@@ -136,7 +135,7 @@ def test_the_plan_is_the_whole_grid(tmp_path: Path, name: str) -> None:
     learned = {method for method in budget.methods if isinstance(find_method(method), Learned)}
     grid_of_policies = {(method, mix, seed) for method in learned for mix in budget.mixes for seed in budget.seeds}
     trained = [(job.method, job.mix, job.seed) for job in jobs if isinstance(job, TrainJob)]
-    tested = [(job.method, job.mix, job.seed) for job in jobs if isinstance(job, jobs.EvaluateJob)]
+    tested = [(job.method, job.mix, job.seed) for job in jobs if isinstance(job, EvaluateJob)]
     assert len(trained) == len(grid_of_policies) and set(trained) == grid_of_policies
     assert set(tested) == grid_of_policies | {(method, None, 0) for method in budget.methods if method not in learned}
     assert sum(isinstance(job, CeilingJob) for job in jobs) == 1
@@ -153,7 +152,7 @@ def test_what_a_job_needs_comes_before_it(tmp_path: Path, name: str) -> None:
 
 def test_one_seed_is_finished_before_the_next_is_begun(tmp_path: Path) -> None:
     jobs = plan(BUDGETS["full"], tmp_path)
-    seeds = [job.seed for job in jobs if isinstance(job, TrainJob | jobs.EvaluateJob) and job.mix is not None]
+    seeds = [job.seed for job in jobs if isinstance(job, TrainJob | EvaluateJob) and job.mix is not None]
     assert seeds == sorted(seeds)
 
 
@@ -191,7 +190,7 @@ def test_ma_needs_the_oracle_s_training_with_the_same_seed_and_mix(tmp_path: Pat
 
 def test_a_training_that_is_shared_is_done_without_its_method_being_asked_for(tmp_path: Path, budget: Budget) -> None:
     jobs = plan(replace(budget, methods=("ma",)), tmp_path)
-    assert [job.name for job in jobs if isinstance(job, TrainJob | jobs.EvaluateJob)] == [
+    assert [job.name for job in jobs if isinstance(job, TrainJob | EvaluateJob)] == [
         "train oracle-P0.4-seed0",
         "train ma-P0.4-seed0",
         "evaluate ma-P0.4-seed0",
@@ -201,11 +200,11 @@ def test_a_training_that_is_shared_is_done_without_its_method_being_asked_for(tm
 def test_shipped_policies_are_tested_where_the_budget_says_so(
     tmp_path: Path, budget: Budget, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plan, "shipped_policies", lambda: ["vae", "oracle"])
+    monkeypatch.setattr("tint_sumo.study.plan.shipped_policies", lambda: ["vae", "oracle"])
 
     def given(with_shipped: bool) -> list[str]:
         jobs = plan(replace(budget, with_shipped=with_shipped), tmp_path)
-        return [job.name for job in jobs if isinstance(job, jobs.EvaluateJob) and job.mix is None]
+        return [job.name for job in jobs if isinstance(job, EvaluateJob) and job.mix is None]
 
     assert given(False) == ["evaluate always_go"]
     assert given(True) == ["evaluate always_go", "evaluate vae-shipped", "evaluate oracle-shipped"]

@@ -26,10 +26,11 @@ from tint_sumo.bench.measuring import Clocks, Turn, turns_apart
 from tint_sumo.bench.policies import DECISION_METHOD, INSTALL_SB3_CONTRIB, decision_ms, training_speed
 from tint_sumo.config import PPO_BUDGETS, TRAIT_BUDGETS, WINDOW_STEPS, PpoSettings
 from tint_sumo.core.determinism import single_threaded
-from tint_sumo.core.progress import make_bar
+from tint_sumo.core.progress import Progress
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.sb3 import SceneVecEnv
+from tint_sumo.jobs.table import one_job
 from tint_sumo.scenes import T_INTERSECTION, find_scene
 from tint_sumo.simulation.scene import SceneSimulation
 from tint_sumo.simulation.sumo import SUMO_COLLISION_CHECK
@@ -168,10 +169,10 @@ def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmar
     sizes = sizes or Sizes()
     measurements = (_speed, _scenes, _breakdown, _gym_speed, _cores, _record, _memory, _traits, _policies)
     found: dict[str, Any] = {}
-    with make_bar(total=len(measurements), desc="bench", unit="measurement", disable=not progress) as bar:
-        for measurement in measurements:
+    with one_job("bench", progress=progress) as report:
+        for number, measurement in enumerate(measurements):
+            report(Progress(number, len(measurements), "measurement"))
             found |= measurement(sizes)
-            bar.update()
     return Benchmark(**found)
 
 

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
-from tint_sumo.core.processes import answer, start_worker, told
+from tint_sumo.core.processes import result_of, start_worker, value_of
 from tint_sumo.simulation.timing import marked_methods
 
 Turn = Callable[[], float]  # measures once more and returns what it found
@@ -57,7 +57,7 @@ def turns_apart(make: Callable[..., AbstractContextManager[Turn]], *arguments: A
 
     def turn() -> float:
         pipe.send("turn")
-        return float(answer(pipe.recv(), "the process that measures"))
+        return float(value_of(pipe.recv(), "the process that measures"))
 
     try:
         yield turn
@@ -69,4 +69,4 @@ def turns_apart(make: Callable[..., AbstractContextManager[Turn]], *arguments: A
 def _serve_turns(pipe: Connection, make: Callable[..., AbstractContextManager[Turn]], *arguments: Any) -> None:
     with make(*arguments) as turn, suppress(EOFError, ConnectionError):  # nobody is at the other end
         while pipe.recv():
-            pipe.send(told(turn))
+            pipe.send(result_of(turn))

@@ -46,9 +46,7 @@ class TrainPolicy(Command):
     """Write the policy as Stable-Baselines3's policy.zip, too. That is a pickle: others must trust you to read it."""
 
     def run(self) -> Outcome:
-        from tint_sumo.config import share_words
         from tint_sumo.films.training_films import film_policy
-        from tint_sumo.jobs.status import Title
         from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.training import train_policy
         from tint_sumo.scenes import ALL_SCENES, find_scene
@@ -59,8 +57,7 @@ class TrainPolicy(Command):
         settings = PPO_BUDGET.full(self.budget)
         steps = settings.total_steps if self.steps is None else self.steps
         share = share_of(self.p_conservative) if has_mix else None
-        mix = "" if share is None else share_words(share)
-        with one_job(Title("train", self.method, mix, self.seed)) as report:
+        with one_job(f"train {self.method}") as report:
             policy = train_policy(
                 self.method,
                 share,
@@ -103,8 +100,8 @@ class EvaluatePolicy(SpreadCommand):
     """Read .zip files, which can run any code: only for files you trust."""
 
     def run(self) -> Outcome:
-        from tint_sumo.core.progress import progress_bar
         from tint_sumo.envs.rows import OUTCOMES
+        from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.evaluation import evaluate
         from tint_sumo.methods.evaluation_jobs import evaluate_on
         from tint_sumo.methods.loading import load_policy
@@ -115,7 +112,7 @@ class EvaluatePolicy(SpreadCommand):
         world = world_of(contender, self.p_conservative, self.noise, self.tau)
         with self.workers_of(1) as workers:
             if isinstance(workers, int):
-                with progress_bar(self.model) as report:
+                with one_job(f"evaluate {self.model}") as report:
                     evaluation = evaluate(
                         contender.policy,
                         lambda num_envs: contender.make_venv(num_envs, **world),

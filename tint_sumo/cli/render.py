@@ -37,15 +37,15 @@ class Render(Command):
     """Read .zip files, which can run any code: only for files you trust."""
 
     def run(self) -> Outcome:
-        from tint_sumo.core.progress import progress_bar
         from tint_sumo.films.film import render_case, require_film_file
+        from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.loading import load_policy
 
         require_film_file(self.out)
         use_one_thread()
         contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
         world = world_of(contender, self.p_conservative, self.noise, self.tau)
-        with progress_bar(str(self.out)) as report:
+        with one_job(f"render {self.out}") as report:
             film = render_case(contender, self.case, self.out, seed=self.seed, report=report, **world)
         text = f"{film.outcome} after {film.time_s:.1f} s, {film.frames} frames: {self.out}"
         content = {"model": self.model, "scene": contender.scene_name, **world, "case": self.case, "seed": self.seed}

@@ -39,7 +39,6 @@ class TrainTraits(Command):
     """Keep the windows in a file beside the model instead of in memory, for large datasets; the model is the same."""
 
     def run(self) -> Outcome:
-        from tint_sumo.jobs.status import Title
         from tint_sumo.jobs.table import one_job
         from tint_sumo.traits.datasets import require_used, train_traits
 
@@ -49,7 +48,7 @@ class TrainTraits(Command):
                 raise InputError(f"noise is {self.noise:g} m, and {settings.noise_m:g} m in the budget; give it once")
             settings = replace(settings, noise_m=self.noise)
         require_used(self.method, settings)
-        with one_job(Title("traits", self.method, seed=self.seed)) as report:
+        with one_job(f"traits {self.method}") as report:
             card = train_traits(
                 self.data,
                 self.out,

@@ -21,7 +21,6 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, joined, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
-from tint_sumo.jobs.status import Title
 from tint_sumo.scenes import SCENES, T_INTERSECTION
 from tint_sumo.scenes.geometry import Floats
 from tint_sumo.study.folders import RESULTS
@@ -116,10 +115,6 @@ class TransferJob:
     @property
     def name(self) -> str:
         return f"{self.method}-{self._choice}-seed{self.seed}"
-
-    @property
-    def title(self) -> Title:
-        return Title(f"traits from {self._choice}", self.method, seed=self.seed)
 
     @property
     def _choice(self) -> str:

@@ -28,7 +28,6 @@ from tint_sumo.core.structures import overlay, require_fields
 from tint_sumo.core.yaml_files import read_list
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.jobs import Workers, executor_of
-from tint_sumo.jobs.status import Title
 from tint_sumo.methods.evaluation import TUNING_CASES, require_cases, require_seed
 from tint_sumo.methods.registry import METHODS, Learned, find_learned, with_shared_trainings
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, digest_of
@@ -177,11 +176,6 @@ class VariantJob:
     @property
     def name(self) -> str:
         return self._of_variant(self.job.name)
-
-    @property
-    def title(self) -> Title:
-        title = self.job.title
-        return replace(title, task=self._of_variant(title.task))
 
     @property
     def needs(self) -> tuple[str, ...]:

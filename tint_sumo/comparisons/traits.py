@@ -19,7 +19,6 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
-from tint_sumo.jobs.status import Title
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.traits.datasets import train_on_split
 from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, linear_r2
@@ -131,10 +130,6 @@ class CompareJob:
         return f"{self.method} seed{self.seed}"
 
     @property
-    def title(self) -> Title:
-        return Title("compare", self.method, seed=self.seed)
-
-    @property
     def inputs(self) -> tuple[str, ...]:
         return (_DATA, *map(_other_data, self.study.other_p))
 
@@ -216,10 +211,6 @@ class ContinuousJob:
     @property
     def name(self) -> str:
         return f"{self.method} continuous {self.latent_size} latents seed{self.seed}"
-
-    @property
-    def title(self) -> Title:
-        return Title(f"continuous, {self.latent_size} latents", self.method, seed=self.seed)
 
     @property
     def outputs(self) -> tuple[str, ...]:

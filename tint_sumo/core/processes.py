@@ -1,4 +1,4 @@
-"""Worker processes that never outlive the main process, and how they tell what became of their work."""
+"""Worker processes that never outlive the main process, and the results that they send."""
 
 import atexit
 import gc
@@ -15,7 +15,7 @@ from typing import Any, Literal, NoReturn
 
 from tint_sumo.core.errors import DivergedError, InputError
 
-Told = tuple[Literal["done", "refused", "diverged", "failed"], Any]
+WorkResult = tuple[Literal["done", "refused", "diverged", "failed"], Any]
 
 # A child forked from this process would share a running libsumo. One forked from the server, which runs no simulation,
 # starts in milliseconds with all modules loaded, where a new interpreter loads them for seconds.
@@ -26,9 +26,9 @@ _FOR_MAIN = {signal.SIGINT, signal.SIGTERM}  # signals to a whole process group;
 def start_worker(
     target: Callable[..., None], *arguments: Any, daemon: bool = True
 ) -> tuple[connection.Connection, Any]:
-    """Start ``target(pipe, *arguments)`` in a process of its own; this end of the pipe, and the process.
+    """Start ``target(pipe, *arguments)`` in a worker; return this end of the pipe, and the process.
 
-    It never sees Ctrl-C: the main process tells it to end. A daemon cannot start workers itself.
+    The worker never sees Ctrl-C: the main process ends it. A daemon cannot start workers itself.
     """
     context = worker_context()
     pipe, theirs = context.Pipe()
@@ -92,8 +92,8 @@ def _raise_interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def told(work: Callable[[], Any]) -> Told:
-    """Do some work in a worker; what to send of it."""
+def result_of(work: Callable[[], Any]) -> WorkResult:
+    """Do some work in a worker; return how it ended, with its value or the reason, to be sent."""
     try:
         return "done", work()
     except InputError as error:
@@ -106,18 +106,18 @@ def told(work: Callable[[], Any]) -> Told:
         return "failed", traceback.format_exc()
 
 
-def answer(message: Told, worker: str) -> Any:
-    """What a worker's work gave.
+def value_of(result: WorkResult, worker: str) -> Any:
+    """Return the value of a worker's work.
 
     Raises:
         InputError, DivergedError, RuntimeError: it was refused, it diverged, or it failed.
     """
-    kind, content = message
-    if kind == "refused":
+    how, content = result
+    if how == "refused":
         raise InputError(content)
-    if kind == "diverged":
+    if how == "diverged":
         raise DivergedError(content)
-    if kind == "failed":
+    if how == "failed":
         raise RuntimeError(f"{worker} failed:\n{content}")
     return content
 
@@ -125,7 +125,7 @@ def answer(message: Told, worker: str) -> Any:
 def end_with_parent() -> None:
     """End this worker as soon as its parent is gone.
 
-    A killed main process cannot tell anyone, and two runs must never write the same files.
+    A killed main process cannot end its workers, and two runs must never write the same files.
     """
     threading.Thread(target=_watch_parent, daemon=True).start()
 

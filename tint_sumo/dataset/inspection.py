@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import whole_file
-from tint_sumo.core.progress import make_bar
+from tint_sumo.core.progress import Progress
 from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, Manifest, read_manifest, read_shards
+from tint_sumo.jobs.table import one_job
 
 RESOLUTION = 0.01  # m, m/s or s: values are rounded to multiples of it
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -149,10 +150,10 @@ def _shards(folder: Path, manifest: Manifest, progress: bool) -> Iterator[pd.Dat
         read_shards(folder, TRAJECTORIES, manifest, [*_KEYS, "time_s", "speed_mps", "gap_m"]),
         read_shards(folder, DRIVERS, manifest, [*_KEYS, "trait"]),
     )
-    with make_bar(total=manifest.shards, desc="inspect", unit="shard", disable=not progress) as bar:
-        for rows, drivers in zip(*tables, strict=True):
+    with one_job("inspect", progress=progress) as report:
+        for shard, (rows, drivers) in enumerate(zip(*tables, strict=True)):
+            report(Progress(shard, manifest.shards, "shard"))
             yield rows.merge(drivers, on=_KEYS)
-            bar.update()
 
 
 def _statistics(rows: pd.DataFrame) -> TraitStatistics:

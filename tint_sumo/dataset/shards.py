@@ -21,7 +21,7 @@ from tint_sumo.config import NO_LEADER_GAP_M, WINDOW_STEPS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.file_changes import write_files
 from tint_sumo.core.files import claim_folder, whole_file, write_json
-from tint_sumo.core.progress import make_bar
+from tint_sumo.core.progress import Progress
 from tint_sumo.core.provenance import versions
 from tint_sumo.core.stores import Store, is_url, working_folder
 from tint_sumo.dataset.schema import (
@@ -41,6 +41,7 @@ from tint_sumo.dataset.schema import (
 )
 from tint_sumo.dataset.windows import count_windows
 from tint_sumo.jobs import Executor, Work, Workers, executor_of
+from tint_sumo.jobs.table import one_job
 
 EPISODE_STEPS = 500
 _WINDOWS_KEY = b"tint_sumo.windows"
@@ -128,15 +129,13 @@ def _finished(folder: Path, store: Store, shards: Work[ShardContents]) -> Manife
 def _record(windows: int, shards: Work[ShardContents], executor: Executor, progress: bool) -> list[ShardContents]:
     found: list[ShardContents] = []
     done = 0
-    with (
-        make_bar(total=windows, desc="record", unit=" windows", disable=not progress) as bar,
-        executor.map(shards, count()) as recorded,
-    ):
+    with one_job("record", progress=progress) as report, executor.map(shards, count()) as recorded:
+        report(Progress(0, windows, "window"))
         for shard in recorded:
             found.append(shard)
-            bar.update(min(shard.windows, windows - done))
-            done += shard.windows
-            if done >= windows:
+            done = min(done + shard.windows, windows)
+            report(Progress(done, windows, "window"))
+            if done == windows:
                 break
     return found
 

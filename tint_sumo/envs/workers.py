@@ -21,7 +21,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from tint_sumo.core.processes import answer, start_worker, told
+from tint_sumo.core.processes import result_of, start_worker, value_of
 from tint_sumo.envs.batch import Ended, LocalBatch, Snapshot
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import Rows, row_type
@@ -122,7 +122,7 @@ class _Helper:
                 f"environment worker {self.worker} died with exit code {self.process.exitcode}; "
                 "reset all environments to start it anew"
             ) from None
-        return answer(message, f"environment worker {self.worker}")
+        return value_of(message, f"environment worker {self.worker}")
 
 
 def _start(
@@ -204,7 +204,7 @@ def _serve(
     line = _Line(pipe, shared.sent[worker, ::-1])
     with suppress(EOFError, ConnectionError):  # the other end is closed
         make_batch = partial(LocalBatch, share.stop - share.start, settings, autoreset_mode, shared.rows[share])
-        line.send(told(lambda: _answer_requests(line, make_batch)))
+        line.send(result_of(lambda: _answer_requests(line, make_batch)))
 
 
 def _answer_requests(line: _Line, make_batch: Callable[[], LocalBatch]) -> None:

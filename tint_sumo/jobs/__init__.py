@@ -1,4 +1,4 @@
-"""Where work is done: in processes of this machine, or on a Ray cluster.
+"""Executors of work: processes of this machine, or a Ray cluster.
 
 An executor runs jobs, which leave files in a folder, and does numbered pieces of work in order. Ray is imported by
 ``tint_sumo.jobs.cluster`` alone.
@@ -11,7 +11,7 @@ Workers = int | Executor  # so many processes of this machine, or an executor
 
 
 def executor_of(workers: Workers) -> Executor:
-    """The executor that ``workers`` stands for.
+    """Return the executor that ``workers`` stands for.
 
     Raises:
         InputError: fewer workers than one.

@@ -2,7 +2,7 @@
 
 No disk is shared. A job's inputs, and what it has left so far, travel through Ray's object store to a scratch folder of
 the node that does it, and what changes among its outputs travels back every few seconds, so that a job whose node dies
-is begun again with its last checkpoint. Pieces of work travel likewise, as a whole.
+begins again with its last checkpoint. Pieces of work travel likewise, as a whole.
 """
 
 import logging
@@ -15,27 +15,27 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib import import_module
 from importlib.metadata import version
 from itertools import count, islice
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import ray
-from ray._private import ray_constants
 from ray.exceptions import RayError, RayTaskError
 
 from tint_sumo.core.errors import InputError, JobError
-from tint_sumo.core.file_changes import Changes, file_states, read_files, write_files
-from tint_sumo.core.processes import Told, interrupt_on_sigterm, told
+from tint_sumo.core.file_changes import Changes, FileState, file_states, read_files, write_files
+from tint_sumo.core.processes import WorkResult, interrupt_on_sigterm, result_of
 from tint_sumo.core.progress import Progress
 from tint_sumo.core.provenance import PACKAGES
-from tint_sumo.jobs.jobs import ALLOWED, Begun, Ended, How, Job, News, Work, last_line, run_jobs
+from tint_sumo.jobs.jobs import MAX_ATTEMPTS, Ended, Event, How, Job, Started, Work, last_line, run_jobs
 from tint_sumo.jobs.process import INTERRUPT_S, JobProcess, log_path
 
 T = TypeVar("T")
 
-LOOK_INTERVAL_S = 2.0  # so often a job's outputs are looked at, and its news sent
-ANSWER_S = 5.0  # so long a cluster may take to answer
+LOOK_INTERVAL_S = 2.0  # between two looks at a job's outputs, with which its events are sent
+ANSWER_S = 5.0  # the longest time that a cluster may take to answer
 PIECES_PER_CPU = 2  # pieces that are done or wait on a CPU: nobody is idle while results travel
 _OPTIONS: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
 _HEAD = {"node:__internal_head__": 0.001}  # Ray's resource that only the head node has
@@ -45,7 +45,7 @@ Files = Mapping[str, bytes | None]  # contents by path relative to a folder
 
 @contextmanager
 def ray_cluster(address: str = "auto", gpus_per_job: float = 0.0) -> Iterator["RayCluster"]:
-    """In the block, an executor on the Ray cluster at an address.
+    """Give, in the block, an executor on the Ray cluster at an address.
 
     Args:
         address: ``ray://host:port`` of a cluster, ``host:port`` of one that this machine is a node of, ``"local"`` for
@@ -54,12 +54,12 @@ def ray_cluster(address: str = "auto", gpus_per_job: float = 0.0) -> Iterator["R
         gpus_per_job: share of a GPU that each job has that a GPU makes faster, if the cluster has GPUs.
 
     Raises:
-        InputError: there is no cluster at the address, or no such share of a GPU.
+        InputError: there is no cluster at the address, no such share of a GPU, or Ray is of another version.
     """
     if not 0.0 <= gpus_per_job < float("inf"):
         raise InputError(f"gpus_per_job must be 0 or more, not {gpus_per_job:g}")
     dashboard_url = _connect(address)
-    interrupt_on_sigterm()  # Ray has set an answer of its own
+    interrupt_on_sigterm()  # Ray has set another handler
     try:
         yield RayCluster(gpus_per_job, dashboard_url)
     except RayError as error:
@@ -69,8 +69,8 @@ def ray_cluster(address: str = "auto", gpus_per_job: float = 0.0) -> Iterator["R
 
 
 def _connect(address: str) -> str:
-    """Connect this process; where the cluster's dashboard is."""
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody is told of what runs here
+    """Connect this process; return the address of the cluster's dashboard."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing about what runs here is sent to Ray's makers
     if address == "local":
         return _start()
     if address != "auto":
@@ -84,18 +84,36 @@ def _connect(address: str) -> str:
 
 
 def _start() -> str:
-    """Start Ray on this machine, on the loopback interface alone, as it does of itself on macOS; its dashboard."""
-    name = ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR  # for the processes that begin here
-    before = os.environ.get(name), ray_constants.ENABLE_RAY_CLUSTER
-    os.environ[name], ray_constants.ENABLE_RAY_CLUSTER = "0", False
-    try:
+    """Start Ray on the loopback interface of this machine, as by default on macOS; return its dashboard's address."""
+    with _on_loopback_alone():
         return ray.init("local", **_OPTIONS).dashboard_url or ""
+
+
+@contextmanager
+def _on_loopback_alone() -> Iterator[None]:
+    """Keep a Ray that starts in the block on the loopback interface, for which it has a private switch alone.
+
+    Raises:
+        InputError: this version of Ray has no such switch.
+    """
+    try:
+        constants: Any = import_module("ray._private.ray_constants")
+        variable = constants.ENABLE_RAY_CLUSTERS_ENV_VAR  # for the processes that Ray starts
+        before = os.environ.get(variable), constants.ENABLE_RAY_CLUSTER
+    except (ImportError, AttributeError):
+        raise InputError(
+            f"Ray {ray.__version__} cannot be kept from other machines by this version of tint_sumo; install ray 2.60, "
+            "or start a cluster and give its `address`"
+        ) from None
+    os.environ[variable], constants.ENABLE_RAY_CLUSTER = "0", False
+    try:
+        yield
     finally:
-        _, ray_constants.ENABLE_RAY_CLUSTER = before
+        _, constants.ENABLE_RAY_CLUSTER = before
         if before[0] is None:
-            del os.environ[name]
+            del os.environ[variable]
         else:
-            os.environ[name] = before[0]
+            os.environ[variable] = before[0]
 
 
 def _require_answer(address: str) -> None:
@@ -108,7 +126,7 @@ def _require_answer(address: str) -> None:
 
 
 def _resources() -> dict[str, float]:
-    """All that the cluster's nodes have."""
+    """Return the resources of all nodes of the cluster."""
     found: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
     return found
 
@@ -122,7 +140,7 @@ class RayCluster:
     """An executor; ``ray_cluster`` makes one."""
 
     gpus_per_job: float = 0.0
-    dashboard_url: str = ""  # where Ray shows what the cluster does; empty where it does not
+    dashboard_url: str = ""  # of Ray's page about the cluster; empty if there is none
 
     @property
     def slots(self) -> int:
@@ -165,7 +183,7 @@ class _Piece(Generic[T]):
         return _do_piece.remote(self._work, self._number, files, _versions())
 
     def result(self) -> T:
-        """Wait for what it gives.
+        """Wait for its result and return it.
 
         Raises:
             InputError, JobError: it was refused, or it failed or was lost again and again.
@@ -179,7 +197,7 @@ class _Piece(Generic[T]):
             if how == "refused":
                 raise InputError(str(content))
             self._ends[how] += 1
-            if self._ends[how] >= ALLOWED[how]:
+            if self._ends[how] >= MAX_ATTEMPTS[how]:
                 raise JobError(f"piece {self._number} {how} {self._ends[how]} times: {last_line(str(content))}")
             self.task = self._submit()
 
@@ -193,7 +211,7 @@ def _cancel(tasks: list[Any]) -> None:
 
 
 def _end_of(task: Any, out: Path) -> tuple[How, Any]:
-    """How a task ended, and what it gave or what is to be said of it; the files that it has left are written."""
+    """Write the files that a task has left; return how it ended, with its result or the reason."""
     try:
         (how, content), files = ray.get(task)
     except RayTaskError as error:
@@ -205,31 +223,34 @@ def _end_of(task: Any, out: Path) -> tuple[How, Any]:
 
 
 @ray.remote(num_cpus=1, max_retries=0)  # pieces that are lost are counted, and submitted with what is there by then
-def _do_piece(work: Work[Any], number: int, files: Files, versions: Mapping[str, str]) -> tuple[Told, Files]:
-    """Do a piece in a scratch folder that holds some files; what came out, and the files that it has left."""
+def _do_piece(work: Work[Any], number: int, files: Files, versions: Mapping[str, str]) -> tuple[WorkResult, Files]:
+    """Do a piece in a scratch folder that holds some files; return its result, and the files that it has left."""
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as scratch:
         folder = Path(scratch)
         write_files(folder, files)
         changes = Changes(folder, work.paths(number))
-        return told(lambda: _placed(work, folder, versions)(number)), changes.take()
+        return result_of(lambda: _moved(work, folder, versions)(number)), changes.take()
 
 
 @cache
 def _versions() -> dict[str, str]:
-    """Versions of what may change a result; builds of one version, such as ``2.13.0+cpu``, count as the same."""
+    """Return the versions that may change a result; builds of one version, such as ``2.13.0+cpu``, are the same."""
     return {name: version(name).partition("+")[0] for name in PACKAGES}
 
 
-def _placed(work: Any, folder: Path, versions: Mapping[str, str]) -> Any:
-    """A job, or pieces of work, in another folder.
+def _moved(work: Any, folder: Path, versions: Mapping[str, str]) -> Any:
+    """Return a job, or pieces of work, with another folder.
 
     Raises:
-        InputError: this node has other versions than the driver, and might do another thing.
+        InputError: this node has other versions than the driver, and its results might differ.
     """
-    differing = [name for name, own in _versions().items() if versions[name] != own]
+    here = _versions()
+    differing = [name for name in here if versions[name] != here[name]]
     if differing:
-        own, theirs = (", ".join(f"{name} {of[name]}" for name in differing) for of in (_versions(), versions))
-        raise InputError(f"a node of the cluster has {own}, and this machine has {theirs}; install the same everywhere")
+        node, driver = (", ".join(f"{name} {found[name]}" for name in differing) for found in (here, versions))
+        raise InputError(
+            f"a node of the cluster has {node}, and this machine has {driver}; install the same everywhere"
+        )
     return replace(work, out=folder)
 
 
@@ -238,7 +259,20 @@ class _Task:
     """A job that was submitted."""
 
     job: Job
-    ref: Any  # what it returns
+    ref: Any  # Ray's reference to its result
+
+
+class _FileStore:
+    """Files in Ray's object store, where many jobs can read them; of each file its last state alone is kept."""
+
+    def __init__(self) -> None:
+        self._held: dict[Path, tuple[FileState, Any]] = {}
+
+    def put(self, file: Path, state: FileState) -> Any:
+        """Put a file there unless it is there in this state; return Ray's reference to its content."""
+        if file not in self._held or self._held[file][0] != state:
+            self._held[file] = state, ray.put(file.read_bytes())
+        return self._held[file][1]
 
 
 class _Tasks:
@@ -250,51 +284,47 @@ class _Tasks:
         self._gpus_per_job = gpus_per_job if _resources().get("GPU", 0) > 0 else 0.0
         self._mailbox = _Mailbox.remote()  # type: ignore[attr-defined]
         self._numbers = count()
-        self._tasks: dict[int, _Task] = {}  # by number: what an earlier run of a job still tells does not count
-        self._begun: set[int] = set()
-        self._sent: dict[tuple[Path, tuple[int, int]], Any] = {}  # files in the object store, by path and state
+        self._tasks: dict[int, _Task] = {}  # by number: late messages of an earlier attempt do not count
+        self._running: set[int] = set()
+        self._store = _FileStore()
 
     def start(self, job: Job) -> None:
         number = next(self._numbers)
-        files = {path: self._send(job.out / path, state) for path, state in file_states(job.out, _paths(job))}
+        files = {path: self._store.put(job.out / path, state) for path, state in file_states(job.out, _paths(job))}
         task = _do_job.options(name=job.name, num_gpus=self._gpus_per_job if job.uses_gpu else 0.0)
         ref = task.remote(job, number, self._mailbox, _versions(), list(files), list(files.values()))
         self._tasks[number] = _Task(job, ref)
 
-    def _send(self, file: Path, state: tuple[int, int]) -> Any:
-        """A file in the object store; many jobs may read it."""
-        if (file, state) not in self._sent:
-            self._sent[file, state] = ray.put(file.read_bytes())
-        return self._sent[file, state]
-
-    def listen(self, patience_s: float) -> list[tuple[Job, News]]:
+    def listen(self, patience_s: float) -> list[tuple[Job, Event]]:
         refs = {task.ref: number for number, task in self._tasks.items()}
         if not refs:
             return []
         ended, _ = ray.wait(list(refs), num_returns=1, timeout=patience_s)
         if ended:
             ended, _ = ray.wait(list(refs), num_returns=len(refs), timeout=0)
-        # What a job tells, it tells before it ends.
-        news = [told for message in ray.get(self._mailbox.take.remote()) for told in self._read(*message)]
+        messages = ray.get(self._mailbox.take.remote())  # all of those that have ended: a job posts before it ends
+        events = [event for message in messages for event in self._read(*message)]
         for ref in ended:
-            task = self._tasks.pop(refs[ref])
-            news.append((task.job, Ended(*_end_of(task.ref, task.job.out))))
-        return news
+            number = refs[ref]
+            task = self._tasks.pop(number)
+            self._running.discard(number)
+            events.append((task.job, Ended(*_end_of(task.ref, task.job.out))))
+        return events
 
-    def _read(self, number: int, news: News | None, files: Files) -> list[tuple[Job, News]]:
+    def _read(self, number: int, event: Event | None, files: Files) -> list[tuple[Job, Event]]:
         if number not in self._tasks:
             return []
-        if isinstance(news, Begun):
-            self._begun.add(number)
+        if isinstance(event, Started):
+            self._running.add(number)
         job = self._tasks[number].job
         write_files(job.out, files)
-        return [] if news is None else [(job, news)]
+        return [] if event is None else [(job, event)]
 
     def interrupt(self) -> None:
         if not self._tasks:
             return
         ray.get(self._mailbox.stop.remote())
-        for number in self._tasks.keys() - self._begun:
+        for number in self._tasks.keys() - self._running:
             ray.cancel(self._tasks[number].ref)
         end_s = time.monotonic() + INTERRUPT_S
         while self._tasks and time.monotonic() < end_s:
@@ -304,24 +334,24 @@ class _Tasks:
 
 
 def _paths(job: Job) -> tuple[str, ...]:
-    """What a job reads, and what it goes on from."""
+    """Return the paths of what a job reads and goes on from."""
     return (*job.inputs, *job.outputs, log_path(job.name))
 
 
 @ray.remote(num_cpus=0, resources=_HEAD)
 class _Mailbox:
-    """Holds what jobs tell until the driver takes it. It is on the head node, without which there is no cluster."""
+    """Messages of jobs until the driver takes them. It is on the head node, without which there is no cluster."""
 
     def __init__(self) -> None:
-        self._messages: list[tuple[int, News | None, Files]] = []
+        self._messages: list[tuple[int, Event | None, Files]] = []
         self._is_over = False
 
-    def post(self, number: int, news: News | None, files: Files) -> bool:
-        """Leave a message; whether the job shall save its work and end."""
-        self._messages.append((number, news, files))
+    def post(self, number: int, event: Event | None, files: Files) -> bool:
+        """Leave a message; return whether the job shall save its work and end."""
+        self._messages.append((number, event, files))
         return self._is_over
 
-    def take(self) -> list[tuple[int, News | None, Files]]:
+    def take(self) -> list[tuple[int, Event | None, Files]]:
         taken, self._messages = self._messages, []
         return taken
 
@@ -333,21 +363,21 @@ class _Mailbox:
 def _do_job(
     job: Job, number: int, mailbox: Any, versions: Mapping[str, str], paths: Sequence[str], contents: Sequence[Any]
 ) -> tuple[tuple[How, str], Files]:
-    """Do a job in a scratch folder that holds some files; how it ended, and what it has left since its last message."""
+    """Do a job in a scratch folder that holds some files; return how it ended, and its files since its last message."""
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as scratch:
         folder = Path(scratch)
         for path, content in zip(paths, contents, strict=True):  # in memory one after the other
             write_files(folder, {path: _wait_for(content)})
         try:
-            placed = _placed(job, folder, versions)
+            moved = _moved(job, folder, versions)
         except InputError as error:
             return ("refused", str(error)), {}
         changes = Changes(folder, (*job.outputs, log_path(job.name)))
 
-        def post(news: News | None) -> bool:
-            return bool(_wait_for(mailbox.post.remote(number, news, changes.take(time.time()))))
+        def post(event: Event | None) -> bool:
+            return bool(_wait_for(mailbox.post.remote(number, event, changes.take(time.time()))))
 
-        process = JobProcess(placed)
+        process = JobProcess(moved)
         try:
             ended = _attend(process, post)
         finally:
@@ -357,21 +387,21 @@ def _do_job(
 
 
 def _wait_for(reference: Any) -> Any:
-    """What Ray holds or will hold. A job that waits in ``ray.get`` lends its CPU, and another one then keeps it."""
+    """Return what a reference of Ray stands for. In ``ray.get`` a job lends its CPU, which another one keeps."""
     return reference.future().result()
 
 
-def _attend(process: JobProcess, post: Callable[[News | None], bool]) -> Ended:
-    """Pass on what a job tells until it ends."""
+def _attend(process: JobProcess, post: Callable[[Event | None], bool]) -> Ended:
+    """Pass on the events of a job until it ends."""
     latest: Progress | None = None
     looked_s = time.monotonic()
-    post(Begun())
+    post(Started())
     while True:
         if process.pipe.poll(max(0.0, looked_s + LOOK_INTERVAL_S - time.monotonic())):
-            news = process.receive()
-            if isinstance(news, Ended):
-                return news
-            latest = news
+            event = process.receive()
+            if isinstance(event, Ended):
+                return event
+            latest = event
         else:
             looked_s = time.monotonic()
             if post(latest):

@@ -1,4 +1,4 @@
-"""Jobs, in which order they run, and what becomes of those that fail."""
+"""Jobs: their order, and how often those are repeated that fail."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -10,15 +10,14 @@ from typing import Literal, Protocol, TypeVar
 
 from tint_sumo.core.errors import InputError, JobError
 from tint_sumo.core.progress import Progress, Report
-from tint_sumo.jobs.status import Title
 from tint_sumo.jobs.table import JobTable, job_table
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
 THREADS_PER_JOB = 1  # threads of torch: the jobs share the cores among them
-# After how many runs that have ended like this work is given up; it is lost with the machine that did it.
-ALLOWED = {"refused": 1, "diverged": 1, "failed": 3, "lost": 20}
+# Attempts that may end like this before work is given up; it is lost with the machine that did it.
+MAX_ATTEMPTS = {"refused": 1, "diverged": 1, "failed": 3, "lost": 20}
 REFRESH_S = 1.0
 
 
@@ -34,11 +33,8 @@ class Job(Protocol):
         """The folder; ``dataclasses.replace(job, out=...)`` is the same job in another."""
 
     @property
-    def name(self) -> str: ...
-
-    @property
-    def title(self) -> Title:
-        """How it is shown."""
+    def name(self) -> str:
+        """The name that it is shown by and that its log has; its first word is the task, such as "train"."""
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -59,7 +55,7 @@ class Job(Protocol):
     def is_done(self) -> bool: ...
 
     def run(self, report: Report) -> str:
-        """Do the work and say in a few words what came out; nothing if the last report says it."""
+        """Do the work and return its result in a few words; nothing if the last report has it."""
 
 
 class Work(Protocol[T_co]):
@@ -73,15 +69,15 @@ class Work(Protocol[T_co]):
         """The files in ``out`` that a piece goes on from and writes, as paths relative to it."""
 
     def __call__(self, number: int, /) -> T_co:
-        """Do one piece, as far as its files are not there, and say what came out."""
+        """Do one piece, as far as its files are not there, and return its result."""
 
 
 class Executor(Protocol):
-    """Where work is done."""
+    """Processes or machines that do work."""
 
     @property
     def slots(self) -> int:
-        """How many jobs are done at a time."""
+        """Number of jobs that are done at a time."""
 
     def run(self, jobs: Sequence[Job], progress: bool = True) -> None:
         """Run the jobs that are not done, in the given order as far as their needs allow.
@@ -90,11 +86,11 @@ class Executor(Protocol):
 
         Raises:
             InputError: needs are of no job, or go round in a circle; nothing is done.
-        InputError, JobError: jobs were refused, or failed; all others are done.
+            InputError, JobError: jobs were refused, or failed; all others are done.
         """
 
     def map(self, work: Work[T], numbers: Iterable[int]) -> AbstractContextManager[Iterator[T]]:
-        """In the block, what the pieces of work give, in order; few are done ahead of their use.
+        """Give, in the block, the results of the pieces of work in order; few are done ahead of their use.
 
         Raises:
             InputError, RuntimeError: a piece was refused, or failed.
@@ -102,8 +98,8 @@ class Executor(Protocol):
 
 
 @dataclass(frozen=True)
-class Begun:
-    """A job is being done from now on."""
+class Started:
+    """A job runs from now on."""
 
 
 How = Literal["done", "refused", "diverged", "failed", "lost"]  # lost: with its machine
@@ -111,43 +107,43 @@ How = Literal["done", "refused", "diverged", "failed", "lost"]  # lost: with its
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run of a job ended, and what is to be said of it."""
+    """End of an attempt at a job, and the result or the reason."""
 
     how: How
     text: str = ""
 
 
-News = Begun | Progress | Ended
+Event = Started | Progress | Ended
 
 
 class Host(Protocol):
-    """What does jobs for ``run_jobs``."""
+    """Processes or a cluster that do jobs for ``run_jobs``."""
 
     @property
     def room(self) -> float:
-        """How many jobs it takes at a time."""
+        """Number of jobs that it takes at a time."""
 
     def start(self, job: Job) -> None: ...
 
-    def listen(self, patience_s: float) -> Sequence[tuple[Job, News]]:
-        """What is new of the jobs that were started; waits for so long if there is nothing."""
+    def listen(self, patience_s: float) -> Sequence[tuple[Job, Event]]:
+        """Return the new events of the jobs that were started; wait for so long if there is none."""
 
     def interrupt(self) -> None:
-        """Let the jobs that are being done save their work and end."""
+        """Let the jobs that run save their work and end."""
 
 
 def run_jobs(jobs: Sequence[Job], host: Host, progress: bool = True) -> None:
-    """``Executor.run`` on a host."""
+    """Run jobs on a host, as ``Executor.run``."""
     require_order(jobs)
     ledger = _Ledger([job for job in jobs if not job.is_done()])
-    titles = [job.title for job in ledger.waiting]
-    with job_table(titles, len(jobs) - len(titles), progress=progress) as table:
+    names = [job.name for job in ledger.waiting]
+    with job_table(names, len(jobs) - len(names), progress=progress) as table:
         try:
             while ledger.waiting or ledger.started:
                 for job in ledger.take(host.room):
                     host.start(job)
-                for job, news in host.listen(REFRESH_S):
-                    _tell(table, ledger, job, news)
+                for job, event in host.listen(REFRESH_S):
+                    _note(table, ledger, job, event)
                 table.refresh()
         finally:
             host.interrupt()
@@ -159,43 +155,43 @@ def require_order(jobs: Sequence[Job]) -> None:
     needs = {job.name: job.needs for job in jobs}
     twice = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
     if twice:
-        raise InputError(f"two jobs are called {twice[0]!r}; give each its own name")
-    for name, needed in needs.items():
-        if missing := [one for one in needed if one not in needs]:
-            raise InputError(f"job {name!r} needs {missing[0]!r}, which is none of the jobs; run it with them")
+        raise InputError(f"two jobs are called {twice[0]!r}; give each another name")
+    for job, needed in needs.items():
+        if missing := [name for name in needed if name not in needs]:
+            raise InputError(f"job {job!r} needs {missing[0]!r}, which is none of the jobs; run it with them")
     try:
         TopologicalSorter(needs).prepare()
     except CycleError as error:
         raise InputError(f"jobs need each other: {' -> '.join(reversed(error.args[1]))}") from None
 
 
-def _tell(table: JobTable, ledger: "_Ledger", job: Job, news: News) -> None:
-    if isinstance(news, Begun):
-        table.begin(job.title)
-    elif isinstance(news, Progress):
-        table.report(job.title, news)
-    elif news.how == "done":
+def _note(table: JobTable, ledger: "_Ledger", job: Job, event: Event) -> None:
+    if isinstance(event, Started):
+        table.begin(job.name)
+    elif isinstance(event, Progress):
+        table.report(job.name, event)
+    elif event.how == "done":
         ledger.close(job)
-        table.end(job.title, news.text)
+        table.end(job.name, event.text)
     else:
-        count, allowed = ledger.note_failure(job, news)
-        table.fail(job.title, f"{news.how}, {count} of {allowed} times: {last_line(news.text)}", again=count < allowed)
+        count, allowed = ledger.note_failure(job, event)
+        table.fail(job.name, f"{event.how}, {count} of {allowed} times: {last_line(event.text)}", again=count < allowed)
         for skipped in ledger.skip():
-            table.fail(skipped.title, "skipped, because it needs a job that was given up", again=False)
+            table.fail(skipped.name, "skipped, because it needs a job that was given up", again=False)
 
 
 @dataclass
 class _Ledger:
-    """Which jobs wait, are started, and were given up."""
+    """The jobs that wait, that are started, and that were given up."""
 
     waiting: list[Job]
     started: list[Job] = field(default_factory=list)
-    _failures: Counter[tuple[str, str]] = field(default_factory=Counter)  # by a job's name, and how its run ended
+    _failures: Counter[tuple[str, str]] = field(default_factory=Counter)  # by a job's name, and how an attempt ended
     _given_up: dict[str, Ended] = field(default_factory=dict)  # by a job's name
     _skipped: list[str] = field(default_factory=list)
 
     def take(self, room: float) -> list[Job]:
-        """The jobs that can be started now, with so many at a time."""
+        """Return the jobs that can be started now, with so many at a time."""
         open_names = {job.name for job in (*self.waiting, *self.started)}
         ready = [job for job in self.waiting if not open_names.intersection(job.needs)]
         free = room - len(self.started)
@@ -209,11 +205,11 @@ class _Ledger:
         self.started.remove(job)
 
     def note_failure(self, job: Job, ended: Ended) -> tuple[int, int]:
-        """How often a job's runs have ended like this, and after how many times it is given up."""
+        """Return how often a job has ended like this, and after how many times it is given up."""
         self.started.remove(job)
         self._failures[job.name, ended.how] += 1
         count = self._failures[job.name, ended.how]
-        allowed = ALLOWED[ended.how]
+        allowed = MAX_ATTEMPTS[ended.how]
         if count < allowed:
             self.waiting.insert(0, job)
         else:
@@ -242,5 +238,5 @@ class _Ledger:
 
 
 def last_line(text: str) -> str:
-    """Of a traceback, the error."""
+    """Return the last line of a text: the error of a traceback."""
     return (text.strip().splitlines() or ["no reason is known"])[-1]

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from tint_sumo.core.processes import begin_work, worker_context
 from tint_sumo.core.ranges import Processes, require_ranges
-from tint_sumo.jobs.jobs import Begun, Ended, Job, News, Work, run_jobs
+from tint_sumo.jobs.jobs import Ended, Event, Job, Started, Work, run_jobs
 from tint_sumo.jobs.process import JobProcess
 
 T = TypeVar("T")
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Local:
-    """An executor of so many processes; a single one does pieces of work in this very process."""
+    """An executor of so many processes; with one worker, this process does pieces of work itself."""
 
     workers: Processes = 1
 
@@ -50,28 +50,30 @@ class _Processes:
     """A host of so many jobs at a time."""
 
     room: int
-    _begun: list[Job] = field(default_factory=list)  # jobs of which nothing was told yet
+    _new: list[Job] = field(default_factory=list)  # jobs whose start was not reported yet
     _running: list[JobProcess] = field(default_factory=list)
 
     def start(self, job: Job) -> None:
         self._running.append(JobProcess(job))
-        self._begun.append(job)
+        self._new.append(job)
 
-    def listen(self, patience_s: float) -> list[tuple[Job, News]]:
-        if self._begun:
-            begun, self._begun = self._begun, []
-            return [(job, Begun()) for job in begun]
-        heard = connection.wait([one.pipe for one in self._running], patience_s)
-        news: list[tuple[Job, News]] = [(one.job, one.receive()) for one in self._running if one.pipe in heard]
-        ended = [job for job, one in news if isinstance(one, Ended)]
-        self._running = [one for one in self._running if one.job not in ended]
-        return news
+    def listen(self, patience_s: float) -> list[tuple[Job, Event]]:
+        if self._new:
+            started, self._new = self._new, []
+            return [(job, Started()) for job in started]
+        heard = connection.wait([process.pipe for process in self._running], patience_s)
+        events: list[tuple[Job, Event]] = [
+            (process.job, process.receive()) for process in self._running if process.pipe in heard
+        ]
+        ended = [job for job, event in events if isinstance(event, Ended)]
+        self._running = [process for process in self._running if process.job not in ended]
+        return events
 
     def interrupt(self) -> None:
-        for one in self._running:
-            one.interrupt()
-        for one in self._running:
-            one.join()
+        for process in self._running:
+            process.interrupt()
+        for process in self._running:
+            process.join()
 
 
 def _ahead(pool: ProcessPoolExecutor, work: Work[T], numbers: Iterable[int], workers: int) -> Iterator[T]:

@@ -1,4 +1,4 @@
-"""A job in a process of its own, which ends cleanly: when it is interrupted, with an error, or with its parent."""
+"""A process that does one job and ends cleanly: when it is interrupted, with an error, or with its parent."""
 
 import os
 import sys
@@ -9,24 +9,24 @@ from pathlib import Path
 from typing import TextIO
 
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.processes import interrupt_on_sigterm, start_worker, told
+from tint_sumo.core.processes import interrupt_on_sigterm, result_of, start_worker
 from tint_sumo.core.progress import Progress
 from tint_sumo.core.redaction import redact
 from tint_sumo.core.stores import Store
 from tint_sumo.jobs.jobs import Ended, Job
 
-REPORT_INTERVAL_S = 0.2  # at most so often a job tells where it stands
+REPORT_INTERVAL_S = 0.2  # the least time between two reports
 INTERRUPT_S = 30.0  # more than enough to save a checkpoint
 LOGS = "logs"  # folder of the jobs' logs in the folder they work in
 
 
 def log_path(name: str) -> str:
-    """Where a job's log is in the folder it works in, as a path relative to it."""
+    """Return the path of a job's log, relative to the folder it works in."""
     return f"{LOGS}/{name.replace(' ', '-').replace('/', '-')}.log"
 
 
 def read_log(out: str | Path, name: str) -> str:
-    """What a job that worked in ``out``, a folder or a URL, has printed, its error included if it failed.
+    """Return what a job that worked in ``out``, a folder or a URL, has printed, its error included if it failed.
 
     Raises:
         InputError: it has no log there.
@@ -49,16 +49,16 @@ class JobProcess:
     def receive(self) -> Progress | Ended:
         """Wait for one message."""
         try:
-            news: Progress | Ended = self.pipe.recv()
+            event: Progress | Ended = self.pipe.recv()
         except EOFError:
             self._process.join()
             return Ended("failed", f"ended with exit code {self._process.exitcode}")
-        if isinstance(news, Ended):
+        if isinstance(event, Ended):
             self._process.join()
-        return news
+        return event
 
     def interrupt(self) -> None:
-        """Tell the process to save its work and end."""
+        """Ask the process to save its work and end."""
         self._process.terminate()
 
     def join(self) -> None:
@@ -68,7 +68,7 @@ class JobProcess:
 
 
 def _work(pipe: Connection, job: Job) -> None:
-    """The worker process."""
+    """Do the job in the worker process."""
     interrupt_on_sigterm()
     log = job.out / log_path(job.name)
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -83,14 +83,14 @@ def _work(pipe: Connection, job: Job) -> None:
                 pipe.send(progress)
 
         with suppress(KeyboardInterrupt):
-            how, text = told(lambda: job.run(report))
+            how, text = result_of(lambda: job.run(report))
             if how != "done":
                 print(text)
             pipe.send(Ended(how, text))
 
 
 def _print_into(file: TextIO) -> None:
-    """What this process and its libraries print goes into a file, line by line."""
+    """Send what this process and its libraries print into a file, line by line."""
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
         os.dup2(file.fileno(), stream.fileno())

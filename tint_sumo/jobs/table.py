@@ -1,4 +1,4 @@
-"""The jobs that are being done: a live table on a terminal, a line a minute in a log file."""
+"""The jobs that run: a live table on a terminal, a line a minute in a log file."""
 
 import math
 import os
@@ -15,71 +15,72 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from tint_sumo.core.progress import LOG_INTERVAL_S, Progress, Report
-from tint_sumo.jobs.status import Overview, Standing, Title, duration
+from tint_sumo.core.progress import Progress, Report
+from tint_sumo.jobs.status import Overview, Status, duration, task_of
 
 TABLE_INTERVAL_S = 0.25
+LOG_INTERVAL_S = 60.0
 _BAR_WIDTH, _ENDLESS = 10, 1000  # characters
-_HEADERS = ("job", "method", "mix", "seed", "", "done", "speed", "left", "so far")
+_HEADERS = ("job", "", "done", "speed", "left", "so far")
 _NARROW_HEADERS = ("job", "done", "so far")
 
 
 class Screen(Protocol):
-    """Where the jobs are shown."""
+    """The terminal or the log file that shows the jobs."""
 
-    def begin(self, title: Title) -> None:
-        """A job begins."""
+    def begin(self, name: str) -> None:
+        """Show that a job begins."""
 
     def end(self, line: str) -> None:
-        """A job has ended; the line says what came out."""
+        """Show that a job has ended, with a line about its result."""
 
     def show(self, overview: Overview, now_s: float) -> None:
-        """Show where all jobs stand; called often, and too early calls do nothing."""
+        """Show the status of all jobs; called often, and too early calls do nothing."""
 
 
 class JobTable:
-    """Is told of some jobs, and shows where they stand; ``job_table`` makes one."""
+    """Shows the status of some jobs; ``job_table`` makes one."""
 
     def __init__(self, overview: Overview, screen: Screen, clock: Callable[[], float] = time.monotonic) -> None:
         self._overview = overview
         self._screen = screen
         self._clock = clock
 
-    def begin(self, title: Title) -> None:
-        """One of the waiting jobs begins."""
+    def begin(self, name: str) -> None:
+        """Note that one of the waiting jobs begins."""
         now_s = self._clock()
-        self._overview.waiting.remove(title)
-        self._overview.standings[title] = Standing(title, now_s)
-        self._screen.begin(title)
+        self._overview.waiting.remove(name)
+        self._overview.running[name] = Status(now_s)
+        self._screen.begin(name)
         self._screen.show(self._overview, now_s)
 
-    def report(self, title: Title, progress: Progress) -> None:
-        """A job tells where it stands."""
-        standings = self._overview.standings
-        standings[title] = standings[title].after(progress, self._clock())
+    def report(self, name: str, progress: Progress) -> None:
+        """Note how far a job is."""
+        running = self._overview.running
+        running[name] = running[name].after(progress, self._clock())
         self.refresh()
 
-    def end(self, title: Title, outcome: str = "") -> None:
-        """A job has ended; ``outcome`` says what came out if its last report does not."""
+    def end(self, name: str, outcome: str = "") -> None:
+        """Note that a job has ended; ``outcome`` is its result if its last report does not have it."""
         now_s = self._clock()
-        standing = self._overview.standings.pop(title)
-        took_s = now_s - standing.began_s
-        self._overview.took_s[title.task].append(took_s)
-        found = outcome or standing.words(now_s).outcomes or "done"
-        self._screen.end(f"{title}: {found} ({duration(took_s)})")
+        status = self._overview.running.pop(name)
+        took_s = now_s - status.began_s
+        self._overview.took_s[task_of(name)].append(took_s)
+        found = outcome or status.text(now_s).outcomes or "done"
+        self._screen.end(f"{name}: {found} ({duration(took_s)})")
         self._screen.show(self._overview, now_s)
 
-    def fail(self, title: Title, reason: str, *, again: bool) -> None:
-        """A job has failed, whether it had begun or not; it waits ``again``, or is given up."""
+    def fail(self, name: str, reason: str, *, again: bool) -> None:
+        """Note that a job has failed, whether it had begun or not; it waits ``again``, or is given up."""
         overview = self._overview
-        overview.standings.pop(title, None)
-        if title in overview.waiting:
-            overview.waiting.remove(title)
+        overview.running.pop(name, None)
+        if name in overview.waiting:
+            overview.waiting.remove(name)
         if again:
-            overview.waiting.append(title)
+            overview.waiting.append(name)
         else:
             overview.given_up += 1
-        self._screen.end(f"{title}: {reason}")
+        self._screen.end(f"{name}: {reason}")
         self._screen.show(overview, self._clock())
 
     def refresh(self) -> None:
@@ -88,8 +89,8 @@ class JobTable:
 
 
 @contextmanager
-def job_table(waiting: Sequence[Title], done: int = 0, *, progress: bool = True) -> Iterator[JobTable]:
-    """A table on stderr of jobs that wait, beside ``done`` others that need not be done again.
+def job_table(waiting: Sequence[str], done: int = 0, *, progress: bool = True) -> Iterator[JobTable]:
+    """Show a table on stderr of jobs that wait, beside ``done`` others that need not be done again.
 
     On a terminal it is redrawn in place, and gone at the end; a line for each job that has ended stays.
     """
@@ -105,25 +106,25 @@ def job_table(waiting: Sequence[Title], done: int = 0, *, progress: bool = True)
 
 
 @contextmanager
-def one_job(title: Title) -> Iterator[Report]:
-    """The table of a single job, which is done in this process; nothing is shown before the first report."""
-    with job_table([title]) as table:
+def one_job(name: str, *, progress: bool = True) -> Iterator[Report]:
+    """Show the table of a single job, which this process does; nothing is shown before the first report."""
+    with job_table([name], progress=progress) as table:
         begun = False
 
         def report(progress: Progress) -> None:
             nonlocal begun
             if not begun:
-                table.begin(title)
+                table.begin(name)
                 begun = True
-            table.report(title, progress)
+            table.report(name, progress)
 
         yield report
         if begun:
-            table.end(title)
+            table.end(name)
 
 
 class _Nowhere:
-    def begin(self, title: Title) -> None: ...
+    def begin(self, name: str) -> None: ...
 
     def end(self, line: str) -> None: ...
 
@@ -137,7 +138,7 @@ class _Terminal:
         self._live = live
         self._drawn_s = -math.inf
 
-    def begin(self, title: Title) -> None: ...
+    def begin(self, name: str) -> None: ...
 
     def end(self, line: str) -> None:
         self._live.console.print(line, markup=False, highlight=False)
@@ -149,39 +150,39 @@ class _Terminal:
 
 
 class Log:
-    """A line when a job begins or ends, and one a minute about all of them."""
+    """A line when a job begins or ends, and a line a minute about all of them."""
 
     def __init__(self, file: TextIO, now_s: float) -> None:
         self._file = file
-        self._told_s = now_s
+        self._written_s = now_s
 
-    def begin(self, title: Title) -> None:
-        self._tell(f"{title}: begins")
+    def begin(self, name: str) -> None:
+        self._write(f"{name}: begins")
 
     def end(self, line: str) -> None:
-        self._tell(line)
+        self._write(line)
 
     def show(self, overview: Overview, now_s: float) -> None:
-        if now_s - self._told_s >= LOG_INTERVAL_S:
-            self._told_s = now_s
-            self._tell(report_line(overview, now_s))
+        if now_s - self._written_s >= LOG_INTERVAL_S:
+            self._written_s = now_s
+            self._write(report_line(overview, now_s))
 
-    def _tell(self, line: str) -> None:
+    def _write(self, line: str) -> None:
         print(line, file=self._file, flush=True)
 
 
 def render(overview: Overview, now_s: float, console: Console) -> RenderableType:
-    """The table: a line for each job or, where the console is too narrow for that, two."""
-    standings = overview.standings.values()
-    table = _table(_HEADERS, [_cells(standing, now_s) for standing in standings])
+    """Return the table: a line for each job or, where the console is too narrow for that, two."""
+    running = overview.running.items()
+    table = _table(_HEADERS, [_cells(name, status, now_s) for name, status in running])
     endless = console.options.update(max_width=_ENDLESS)
     if Measurement.get(console, endless, table).maximum > console.width:
-        table = _table(_NARROW_HEADERS, [_stacked_cells(standing, now_s) for standing in standings])
-    return table if overview.total == 1 else Group(table, Text(_whole(overview, now_s), style="bold"))
+        table = _table(_NARROW_HEADERS, [_stacked_cells(name, status, now_s) for name, status in running])
+    return table if overview.total == 1 else Group(table, Text(_summary(overview, now_s), style="bold"))
 
 
 def _table(headers: Sequence[str], rows: Sequence[Sequence[str | ProgressBar]]) -> Table:
-    """Without the columns that are empty throughout."""
+    """Return a table without the columns that are empty throughout."""
     table = Table(box=None, pad_edge=False, header_style="dim")
     kept = [number for number in range(len(headers)) if any(row[number] for row in rows)]
     for number in kept:
@@ -191,25 +192,23 @@ def _table(headers: Sequence[str], rows: Sequence[Sequence[str | ProgressBar]]) 
     return table
 
 
-def _cells(standing: Standing, now_s: float) -> list[str | ProgressBar]:
-    title, last = standing.title, standing.last
+def _cells(name: str, status: Status, now_s: float) -> list[str | ProgressBar]:
+    text, last = status.text(now_s), status.last
     bar = ProgressBar(last.total if last else 1, last.done if last else 0, width=_BAR_WIDTH)
-    seed = "" if title.seed is None else str(title.seed)
-    told = standing.words(now_s)
-    return [title.task, title.method, title.mix, seed, bar, told.percent, told.speed, told.left, told.outcomes]
+    return [name, bar, text.percent, text.speed, text.left, text.outcomes]
 
 
-def _stacked_cells(standing: Standing, now_s: float) -> list[str | ProgressBar]:
-    title, told = standing.title, standing.words(now_s)
-    left = f"{told.left} left" if told.left else ""
+def _stacked_cells(name: str, status: Status, now_s: float) -> list[str | ProgressBar]:
+    text = status.text(now_s)
+    left = f"{text.left} left" if text.left else ""
     return [
-        f"{title.work}\n{title.circumstances}".strip(),
-        f"{told.percent}  {left}\n{told.speed}".strip(),
-        told.outcomes.replace(", ", "\n"),
+        name.replace(" ", "\n", 1),
+        f"{text.percent}  {left}\n{text.speed}".strip(),
+        text.outcomes.replace(", ", "\n"),
     ]
 
 
-def _whole(overview: Overview, now_s: float) -> str:
+def _summary(overview: Overview, now_s: float) -> str:
     left_s = overview.left_s(now_s)
     left = "" if left_s is None else f", about {duration(left_s)} left"
     given_up = f", {overview.given_up} given up" if overview.given_up else ""
@@ -217,12 +216,12 @@ def _whole(overview: Overview, now_s: float) -> str:
 
 
 def report_line(overview: Overview, now_s: float) -> str:
-    """What the table says, in a line."""
-    jobs = [_sentence(standing, now_s) for standing in overview.standings.values()]
-    return "; ".join(jobs if overview.total == 1 else [_whole(overview, now_s), *jobs])
+    """Return the content of the table in a line."""
+    jobs = [_sentence(name, status, now_s) for name, status in overview.running.items()]
+    return "; ".join(jobs if overview.total == 1 else [_summary(overview, now_s), *jobs])
 
 
-def _sentence(standing: Standing, now_s: float) -> str:
-    told = standing.words(now_s)
-    left = f"{told.left} left" if told.left else ""
-    return f"{standing.title}: " + ", ".join(part for part in (told.percent, told.speed, left, told.outcomes) if part)
+def _sentence(name: str, status: Status, now_s: float) -> str:
+    text = status.text(now_s)
+    left = f"{text.left} left" if text.left else ""
+    return f"{name}: " + ", ".join(part for part in (text.percent, text.speed, left, text.outcomes) if part)

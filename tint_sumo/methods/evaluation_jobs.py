@@ -16,7 +16,6 @@ from tint_sumo.core.progress import Report
 from tint_sumo.core.reading import RESULT_BYTES
 from tint_sumo.jobs import Executor
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
-from tint_sumo.jobs.status import Title
 from tint_sumo.methods.evaluation import BATCH, Case, Evaluation, StoredCase, evaluate, require_cases
 from tint_sumo.methods.loading import Contender, load_policy
 from tint_sumo.scenes import AnyScene, find_scene
@@ -53,10 +52,6 @@ class CasesJob:
     @property
     def name(self) -> str:
         return f"cases {self.first}"
-
-    @property
-    def title(self) -> Title:
-        return Title(f"cases {self.first} to {self.first + self.episodes - 1}")
 
     @property
     def outputs(self) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ from tint_sumo.core.files import damaged, read_record, write_json
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Progress, Report
 from tint_sumo.core.reading import RESULT_BYTES
-from tint_sumo.jobs.status import Title
 from tint_sumo.methods.evaluation import CASES
 from tint_sumo.scenes import T_INTERSECTION, Scene
 from tint_sumo.study.budgets import Trials
@@ -26,7 +25,6 @@ class CeilingJob:
     scene: str | Scene = T_INTERSECTION
 
     name = "ceilings"
-    title = Title("ceilings")
     needs = ()
     inputs = ()
     outputs = (CEILINGS_FILE,)

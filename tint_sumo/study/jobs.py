@@ -7,14 +7,13 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from tint_sumo.config import PpoSettings, Share, ends, share_words
+from tint_sumo.config import PpoSettings, Share, ends
 from tint_sumo.core.files import damaged, write_json
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Report, part_of
 from tint_sumo.core.reading import RESULT_BYTES, require_file
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
-from tint_sumo.jobs.status import Title
 from tint_sumo.methods.evaluation import CASES, Evaluation, evaluate
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.registry import METHODS, Rule, find_learned, find_method
@@ -44,10 +43,6 @@ class TrainJob:
     @property
     def name(self) -> str:
         return f"train {label(self.method, self.mix, self.seed)}"
-
-    @property
-    def title(self) -> Title:
-        return Title("train", self.method, share_words(self.mix), self.seed)
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -115,12 +110,6 @@ class EvaluateJob:
     @property
     def name(self) -> str:
         return f"evaluate {self._label}"
-
-    @property
-    def title(self) -> Title:
-        if self.mix is None:
-            return Title("evaluate", self._label)
-        return Title("evaluate", self.method, share_words(self.mix), self.seed)
 
     @property
     def _label(self) -> str:

@@ -10,7 +10,6 @@ from tint_sumo.core.files import write_json
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Report
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
-from tint_sumo.jobs.status import Title
 from tint_sumo.study.folders import DATASET, trait_folder
 from tint_sumo.traits.datasets import evaluate_traits, plot_traits, train_traits
 from tint_sumo.traits.storage import add_to_card
@@ -33,10 +32,6 @@ class TraitJob:
     @property
     def name(self) -> str:
         return f"traits {self.method}"
-
-    @property
-    def title(self) -> Title:
-        return Title("traits", self.method)
 
     @property
     def outputs(self) -> tuple[str, ...]:

@@ -23,7 +23,6 @@ from tint_sumo.films.driving import Moment, drive_case
 from tint_sumo.films.trait_probe import TraitReader, fit_reader
 from tint_sumo.jobs import Workers, executor_of
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
-from tint_sumo.jobs.status import Title
 from tint_sumo.methods.evaluation import CASES, CASES_PER_SEED
 from tint_sumo.methods.loading import Contender, find_policy, load_policy
 from tint_sumo.methods.registry import METHODS, Rule
@@ -188,10 +187,6 @@ class RecordJob:
     @property
     def name(self) -> str:
         return f"episodes {self.number}"
-
-    @property
-    def title(self) -> Title:
-        return Title("record", self.name)
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 
-from tint_sumo.config import ALL_MIXES
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.jobs import Job, Local
 from tint_sumo.jobs.jobs import Begun, Ended, News, run_jobs
 from tint_sumo.methods.registry import METHODS, Learned
@@ -30,7 +30,9 @@ MACHINES = (1, 8, 64, 1000)
 STUDIES = {
     "--budget full": FULL,
     "the same with 5 seeds": replace(FULL, seeds=tuple(range(5))),
-    "policies for 5 single mixes, 5 seeds": replace(FULL, mixes=(0.1, 0.25, 0.4, 0.6, 0.9), seeds=tuple(range(5))),
+    "policies for 5 single mixes, 5 seeds": replace(
+        FULL, mixes=tuple(map(Mix, (0.1, 0.25, 0.4, 0.6, 0.9))), seeds=tuple(range(5))
+    ),
 }
 
 
@@ -97,7 +99,7 @@ def _training(method: str, rollouts: int) -> Callable[[Path, int], Job]:
 
 
 def _test(cases: int) -> Callable[[Path, int], Job]:
-    trials = (Trials((Conditions(0.4),), cases),)
+    trials = (Trials((Conditions(Mix(0.4)),), cases),)
     return lambda out, seed: EvaluateJob(("oracle", "vae")[seed], None, 0, trials, out)
 
 

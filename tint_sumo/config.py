@@ -8,11 +8,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from numbers import Real
+from typing import Annotated, Any, Literal, Self
 
 from tint_sumo.core.errors import InputError, find_named, shown
 from tint_sumo.core.ranges import Length, Range, require_ranges
-from tint_sumo.core.structures import FieldError, Many, ReadBy, Where, build, choose
+from tint_sumo.core.structures import FieldError, FileForm, Many, ReadBy, Where, build, choose
 
 NO_LEADER_GAP_M = 20.0  # stands for the gap of every driver without a leader, whatever its trait, and caps all gaps
 MIN_WINDOW_STEPS = 2  # shortest window; a single step has no motion
@@ -34,8 +35,6 @@ Backend = Literal["auto", "libsumo", "traci"]
 
 # Numbers that several settings have, with what is sensible; larger ones would fill the memory, or are mistakes.
 Fraction = Annotated[float, Range(0.0, 1.0)]
-Share = Fraction | tuple[Fraction, Fraction]  # a probability, or the range it is drawn from
-ALL_MIXES: Share = (0.1, 0.9)  # P(conservative) is drawn from this range in every episode
 Seed = Annotated[int, Range(0, 1000)]  # of a training, or of a set of cases
 TrafficSeed = Annotated[int, Range(0, 2**32 - 1)]
 SpeedMps = Annotated[float, Range(0.0, 60.0)]
@@ -59,23 +58,6 @@ SomeLayers = Annotated[Many[Layer], Length(1, 8)]
 Decisions = Annotated[int, Range(1, 10**12)]
 DriverSpeedMps = Annotated[float, Range(0.01, 60.0)]  # SUMO writes 0 for less than 0.01
 ArrivalsPerS = Annotated[float, Range(1e-6, 100.0)]
-
-
-def set_floats(owner: object, *names: str) -> None:
-    """Make floats of the numbers in these fields of a frozen dataclass, so that 1 and 1.0 are one value; None stays."""
-    for name in names:
-        value = getattr(owner, name)
-        if value is not None:
-            number = tuple(map(float, value)) if isinstance(value, Sequence) else float(value)
-            object.__setattr__(owner, name, number)
-
-
-def require_distinct(owner: object, *names: str) -> None:
-    """Raise InputError unless these fields have one or more values, each of them once."""
-    for name in names:
-        values = getattr(owner, name)
-        if len(set(values)) < max(1, len(values)):
-            raise InputError(f"{name} must be one or more, each of them once, not {shown(list(values))}")
 
 
 @dataclass(frozen=True)
@@ -200,53 +182,84 @@ def population_name(population: Population) -> str | None:
     return next((name for name, known in POPULATIONS.items() if known == population), None)
 
 
-def ends(share: Share) -> tuple[float, float]:
-    """Both ends of a range; twice the same for a number."""
-    low, high = share if isinstance(share, Sequence) else (share, share)
-    return float(low), float(high)
+@dataclass(frozen=True, order=True, init=False)
+class Mix(FileForm):
+    """P(conservative): each episode draws its probability uniformly from ``low`` to ``high``.
+
+    Files, flags and users write one number where both are the same, and two numbers otherwise.
+    """
+
+    form = "a probability in [0, 1], or two of them from low to high"
+
+    low: float
+    high: float
+
+    def __init__(self, low: float, high: float | None = None) -> None:
+        """Make a mix of one probability, or of the range of two.
+
+        Raises:
+            InputError: they are no probabilities, or ``high`` is less than ``low``.
+        """
+        last = low if high is None else high
+        if not 0.0 <= low <= last <= 1.0:
+            raise InputError(f"P(conservative) must be {self.form}, not {shown(low if high is None else (low, high))}")
+        object.__setattr__(self, "low", float(low))
+        object.__setattr__(self, "high", float(last))
+
+    @classmethod
+    def parse(cls, value: Any) -> Self:
+        """Return the mix that a number or two numbers stand for; a mix itself is returned as it is.
+
+        Raises:
+            InputError: they are no probabilities.
+        """
+        if isinstance(value, cls):
+            return value
+        numbers = value if isinstance(value, list | tuple) else [value]
+        are_numbers = all(isinstance(one, Real) and not isinstance(one, bool) for one in numbers)
+        if not are_numbers or len(numbers) not in (1, 2):
+            raise InputError(f"P(conservative) must be {cls.form}, not {shown(value)}")
+        return cls(*numbers)
+
+    def plain(self) -> float | list[float]:
+        return self.low if self.is_single else [self.low, self.high]
+
+    @property
+    def is_single(self) -> bool:
+        """Whether all episodes have the same probability."""
+        return self.low == self.high
+
+    @property
+    def mean(self) -> float:
+        return (self.low + self.high) / 2
+
+    @property
+    def text(self) -> str:
+        """The mix for people to read, such as ``"0.1 to 0.9"``."""
+        return f"{self.low:g}" + ("" if self.is_single else f" to {self.high:g}")
+
+    @classmethod
+    def from_text(cls, text: str) -> Self:
+        """Return the mix that ``text`` has written."""
+        return cls(*map(float, text.split(" to ")))
+
+    def contains(self, other: "Mix") -> bool:
+        """Whether all probabilities of another mix are among these."""
+        return self.low <= other.low and other.high <= self.high
 
 
-def share_words(share: Share) -> str:
-    """A share for people to read."""
-    low, high = ends(share)
-    return f"{low:g}" + (f" to {high:g}" if high > low else "")
-
-
-def is_share(value: object) -> bool:
-    """Whether a value is a probability or a range of probabilities."""
-    try:
-        low, high = ends(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        return False
-    return 0.0 <= low <= high <= 1.0
-
-
-def require_share(share: Share) -> None:
-    """Raise InputError unless this is a probability or a range of probabilities."""
-    if not is_share(share):
-        raise InputError(
-            f"p_conservative must be a probability in [0, 1], or two of them from low to high, not {share}"
-        )
+ALL_MIXES = Mix(0.1, 0.9)
+AnyMix = Mix | float | Sequence[float]  # what users write for a mix; parsed where it comes in
 
 
 @dataclass(frozen=True)
 class Traffic:
     """How drivers appear on the street."""
 
-    p_conservative: Share = 0.4  # probability that a driver is conservative; a range: drawn uniformly per episode
+    p_conservative: Mix = Mix(0.4)
     arrivals_per_s: ArrivalsPerS | None = None  # Poisson rate per lane; None: saturated, enter as soon as there is room
 
-    @property
-    def p_conservative_range(self) -> tuple[float, float]:
-        """Lowest and highest probability."""
-        return ends(self.p_conservative)
-
-    @property
-    def mean_p_conservative(self) -> float:
-        return sum(self.p_conservative_range) / 2
-
     def __post_init__(self) -> None:
-        require_share(self.p_conservative)
         require_ranges(self)
 
 

@@ -11,6 +11,7 @@ from tests.cli.calls import refuse, run
 from tests.scenes.networks import UserNetwork
 from tint_sumo.cli.command_line import TintSumo, main, parse
 from tint_sumo.cli.configuration import commands_named, subcommands
+from tint_sumo.config import Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.windows import load_drivers, load_labels, load_windows
 from tint_sumo.scenes import Scene, read_scene
@@ -128,7 +129,7 @@ def test_one_value_stands_for_a_list_of_it(tmp_path: Path) -> None:
     text = "p_conservative: 0.4\nbudget: {seeds: 3, methods: oracle, mixes: [0.5, [0.1, 0.9]]}"
     assert parse(["record", "--out", "x", "--config", str(written(tmp_path, text[:20]))]).p_conservative == (0.4,)
     budget = parse(["study", "run", "--config", str(written(tmp_path, text[20:]))]).budget
-    assert (budget.seeds, budget.methods, budget.mixes) == ((3,), ("oracle",), (0.5, (0.1, 0.9)))
+    assert (budget.seeds, budget.methods, budget.mixes) == ((3,), ("oracle",), (Mix(0.5), Mix(0.1, 0.9)))
 
 
 def test_a_budget_equal_to_a_known_one_is_that_one(tmp_path: Path) -> None:
@@ -333,7 +334,7 @@ def test_a_sumo_configuration_as_a_scene(
     found = run(capsys, "policy", "evaluate", "--model", "run", "--episodes", 1)
     assert (found["scene"], found["p_conservative"], found["timeout"]) == ("merge", None, 1.0)
     argv = ("policy", "train", "--method", "oracle", "--config", train, "--out", "new", "--p-conservative", 0.2)
-    assert "leave p_conservative out" in refuse(capsys, *argv)
+    assert "leave p_conservative and tau_s out" in refuse(capsys, *argv)
     evaluation = ("policy", "evaluate", "--episodes", 1, "--model")
     assert "leave p_conservative and tau_s out" in refuse(capsys, *evaluation, "run", "--tau", 2)
     assert "ttc needs a built-in scene" in refuse(capsys, *evaluation, "ttc", "--config", file)

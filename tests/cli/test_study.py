@@ -8,6 +8,7 @@ import pytest
 
 from tests.cli.calls import Started, copy, run
 from tint_sumo.cli import main
+from tint_sumo.config import Mix
 from tint_sumo.core.stores import name_in
 from tint_sumo.methods.evaluation import Case, Evaluation
 from tint_sumo.study.budgets import Conditions
@@ -20,7 +21,7 @@ def small_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A study of three cases."""
     out = tmp_path_factory.mktemp("results")
     cases = Evaluation((Case("success", 12.0),) * 3)
-    result = Result("ttc", GIVEN, None, 0, (Measured(Conditions(0.4), cases),))
+    result = Result("ttc", GIVEN, None, 0, (Measured(Conditions(Mix(0.4)), cases),))
     (out / RESULTS).mkdir()
     (out / RESULTS / "one.json").write_text(json.dumps(result.to_json()))
     assert main(["study", "report", "--out", str(out)]) == 0

@@ -11,7 +11,7 @@ import yaml
 
 from tint_sumo.cli import main
 from tint_sumo.comparisons.sweep import Sweep, VariantJob, plan, read_varied, report_markdown, run_sweep
-from tint_sumo.config import CONSERVATIVE, Population, PpoSettings
+from tint_sumo.config import CONSERVATIVE, Mix, Population, PpoSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import silent
 from tint_sumo.methods.evaluation import TUNING_CASES, evaluate
@@ -28,7 +28,7 @@ LONG = f"[{','.join(['1024'] * 8)}]"
 
 @pytest.fixture(scope="module")
 def sweep(brief: PpoSettings) -> Sweep:
-    return Sweep(brief, {"learning_rate": [1e-3, 3e-3]}, p_conservative=0.4, episodes=3)
+    return Sweep(brief, {"learning_rate": [1e-3, 3e-3]}, p_conservative=Mix(0.4), episodes=3)
 
 
 # A sweep
@@ -62,7 +62,7 @@ def test_policies_are_tested_on_cases_that_are_reported_nowhere(finished: Path) 
     policy = load_policy(finished / VARIANTS[0] / "policies" / "oracle-P0.4-seed0")
     expected = evaluate(policy.policy, lambda count: policy.make_venv(count, p_conservative=0.4), 3, TUNING_CASES)
     result = Result.read(finished / VARIANTS[0] / "results" / "oracle-P0.4-seed0.json")
-    assert (result.case_set, result.tested) == (TUNING_CASES, (Measured(Conditions(0.4), expected),))
+    assert (result.case_set, result.tested) == (TUNING_CASES, (Measured(Conditions(Mix(0.4)), expected),))
 
 
 @pytest.mark.slow
@@ -92,7 +92,7 @@ def test_another_sweep_in_the_same_folder_is_refused(sweep: Sweep, finished: Pat
 
 def test_a_job_works_in_any_folder_that_holds_its_inputs(brief: PpoSettings, tmp_path: Path) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
-    sweep = Sweep(brief, {"n_epochs": [1]}, p_conservative=0.4, episodes=2)
+    sweep = Sweep(brief, {"n_epochs": [1]}, p_conservative=Mix(0.4), episodes=2)
     for job in plan(sweep, here):
         moved = replace(job, out=there)
         assert all((there / path).exists() for path in job.inputs)
@@ -137,7 +137,7 @@ def test_a_method_that_shares_a_training_brings_it_along(brief: PpoSettings, tmp
 
 def test_policies_are_tested_at_the_mixes_of_their_training(brief: PpoSettings) -> None:
     assert Sweep(brief, {"n_epochs": [1]}).tested == (0.25, 0.4, 0.6)
-    assert Sweep(brief, {"n_epochs": [1]}, p_conservative=(0.3, 0.6)).tested == (0.4, 0.6)
+    assert Sweep(brief, {"n_epochs": [1]}, p_conservative=Mix(0.3, 0.6)).tested == (0.4, 0.6)
 
 
 # What is refused

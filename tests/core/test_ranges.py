@@ -17,6 +17,7 @@ from tint_sumo.config import (
     DriverProfile,
     EgoController,
     Idm,
+    Mix,
     PolicySettings,
     Population,
     PpoSettings,
@@ -46,8 +47,8 @@ SETTINGS: tuple[Any, ...] = (
     Traffic(),
     VehicleShape(),
     BUDGETS["quick"],
-    Conditions(0.4),
-    Trials((Conditions(0.4),), 100),
+    Conditions(Mix(0.4)),
+    Trials((Conditions(Mix(0.4)),), 100),
     TraitStudy(),
     SceneStudy(),
 )

@@ -13,7 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams.metadata import PLUGIN_NAME
 
 from tint_sumo.cli import main
-from tint_sumo.config import PolicySettings, PpoSettings, TraitSettings
+from tint_sumo.config import Mix, PolicySettings, PpoSettings, TraitSettings
 from tint_sumo.core.progress import Progress
 from tint_sumo.core.structures import plain as plain_of
 from tint_sumo.dataset.windows import Windows
@@ -39,7 +39,7 @@ def gif_of(policy: Path) -> bytes:
 
 
 def test_a_policy_s_log_holds_outcomes_settings_and_a_film_of_every_kept_policy(tmp_path: Path) -> None:
-    train_policy("no_labels", 0.4, 256, 0, tmp_path, settings=TINY, film=gif_of)
+    train_policy("no_labels", Mix(0.4), 256, 0, tmp_path, settings=TINY, film=gif_of)
     log = read(tmp_path)
     assert {f"rollout/{outcome}" for outcome in ("success", "timeout", "collision")} <= set(log.Tags()["scalars"])
     films = [(film.step, film.width) for film in log.Images("film")]
@@ -52,7 +52,7 @@ def test_the_command_line_films_a_training_and_gives_the_policy_that_python_give
     torch.set_num_threads(2)
     try:
         scene = replace(find_scene("t_intersection"), time_limit_s=2.0)
-        plain = train_policy("oracle", 0.4, 256, 0, tmp_path / "plain", settings=TINY, scene=scene)
+        plain = train_policy("oracle", Mix(0.4), 256, 0, tmp_path / "plain", settings=TINY, scene=scene)
     finally:
         torch.set_num_threads(1)
     config = tmp_path / "train.yaml"
@@ -73,8 +73,8 @@ def test_an_interrupted_training_goes_on_with_the_same_curves(tmp_path: Path) ->
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_policy("no_labels", 0.4, 256, 0, tmp_path, settings=TINY, report=interrupt)
-    train_policy("no_labels", 0.4, 256, 0, tmp_path, settings=TINY)
+        train_policy("no_labels", Mix(0.4), 256, 0, tmp_path, settings=TINY, report=interrupt)
+    train_policy("no_labels", Mix(0.4), 256, 0, tmp_path, settings=TINY)
     steps = [event.step for event in read(tmp_path).Scalars("train/loss")]
     assert steps[-1] == 256 and steps == sorted(set(steps))
 

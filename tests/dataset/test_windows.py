@@ -230,7 +230,7 @@ def test_a_manifest_that_lacks_something(dataset: Path, tmp_path: Path, key: str
         ({"shards": "two"}, "shards: must be a whole number from 0 to 1,000,000, not 'two'"),
         ({"rows": -1}, "rows: must lie in 0 to"),
         ({"scene": ["a"]}, "scene: must be text"),
-        ({"p_conservative": 7}, "p_conservative: must lie in 0 to 1, not 7"),
+        ({"p_conservative": 7}, r"p_conservative: P\(conservative\) must be a probability"),
         ({"sha256": {"a": 1}}, "sha256"),
     ],
 )

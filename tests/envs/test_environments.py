@@ -297,7 +297,7 @@ def test_rendering_shows_every_vehicle() -> None:
     ("arguments", "message"),
     [
         ({"scene": "moon"}, "unknown scene 'moon'; choose one of: .*t_intersection"),
-        ({"p_conservative": 1.5}, "p_conservative must lie in 0 to 1, not 1.5"),
+        ({"p_conservative": 1.5}, r"P\(conservative\) must be a probability .*, not 1.5"),
         ({"p_conservative": (0.6, 0.2)}, r"from low to high, not \(0.6, 0.2\)"),
         ({"p_conservative": (0.1, 0.2, 0.3)}, "must be a probability"),
         ({"tau_s": 0.0}, "tau_s must lie in 0.01 to 20, not 0.0"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from tint_sumo.config import Population, Traffic
+from tint_sumo.config import Mix, Population, Traffic
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs.episodes import (
     Episodes,
@@ -44,8 +44,8 @@ def test_without_settings_the_scene_is_as_it_is() -> None:
 @pytest.mark.parametrize(
     ("settings", "field", "value"),
     [
-        ({"p_conservative": 0.9}, "traffic", replace(T.traffic, p_conservative=0.9)),
-        ({"p_conservative": 0.0}, "traffic", replace(T.traffic, p_conservative=0.0)),
+        ({"p_conservative": 0.9}, "traffic", replace(T.traffic, p_conservative=Mix(0.9))),
+        ({"p_conservative": 0.0}, "traffic", replace(T.traffic, p_conservative=Mix(0.0))),
         ({"time_limit_s": 3.0}, "time_limit_s", 3.0),
         ({"max_episode_steps": 30}, "time_limit_s", pytest.approx(3.0)),
         ({"max_episode_steps": 30, "decision_s": 0.4}, "time_limit_s", pytest.approx(12.0)),
@@ -164,7 +164,7 @@ def test_noise_is_drawn_anew_in_every_step_and_episode() -> None:
 
 
 def test_empty_slots_have_no_trait_and_others_the_number_of_their_profile() -> None:
-    scene = replace(T, population=Population(tuple(reversed(T.population.profiles))), traffic=Traffic(1.0))
+    scene = replace(T, population=Population(tuple(reversed(T.population.profiles))), traffic=Traffic(Mix(1.0)))
     with episodes(1, scene=scene) as batch:
         batch.begin(0, np.random.default_rng(0))
         row = batch.rows[0]

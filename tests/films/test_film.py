@@ -182,7 +182,7 @@ def test_bad_input_leaves_no_file(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=message):
             render_case(contender, case, tmp_path / name, seed=seed)
-    with pytest.raises(InputError, match="p_conservative"):
+    with pytest.raises(InputError, match="must be a probability"):
         render_case(contender, 0, tmp_path / "film.gif", p_conservative=2.0)
     assert not list(tmp_path.iterdir())
 

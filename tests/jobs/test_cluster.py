@@ -22,7 +22,7 @@ from tests.dataset.test_recorder import TWO_SHARDS, contents
 from tests.jobs.jobs import CountJob, FileJob
 from tests.jobs.test_local import PATIENCE_S, wait_until
 from tint_sumo.cli import main
-from tint_sumo.config import PpoSettings
+from tint_sumo.config import Mix, PpoSettings
 from tint_sumo.core.checkpoints import CHECKPOINT_FILE
 from tint_sumo.core.errors import InputError, JobError
 from tint_sumo.core.stores import Store
@@ -209,9 +209,9 @@ def test_a_study_is_the_same_file_for_file(cluster: Executor, brief: PpoSettings
         traits=None,
         ppo=brief,
         methods=("always_go", "oracle"),
-        mixes=(0.4,),
+        mixes=(Mix(0.4),),
         seeds=(0,),
-        trials=(Trials((Conditions(0.4), Conditions(0.4, percent=50)), 3),),
+        trials=(Trials((Conditions(Mix(0.4)), Conditions(Mix(0.4), percent=50)), 3),),
     )
     here, there = tmp_path / "here", tmp_path / "there"
     Local(2).run(plan(budget, here), progress=False)
@@ -235,7 +235,7 @@ def test_a_training_survives_a_node_with_its_checkpoint(
 ) -> None:
     """It takes longer than the 15 s between two checkpoints, and ends as if nothing had happened."""
     settings = replace(brief, total_steps=64 * 700)
-    here, job = (TrainJob("no_labels", 0.4, 0, settings, True, tmp_path / name) for name in ("here", "there"))
+    here, job = (TrainJob("no_labels", Mix(0.4), 0, settings, True, tmp_path / name) for name in ("here", "there"))
     Local(1).run([here], progress=False)
     with meanwhile(lambda: cluster.run([job], progress=False)):
         wait_until((job.folder / CHECKPOINT_FILE).exists)
@@ -249,7 +249,7 @@ def test_a_training_survives_a_node_with_its_checkpoint(
 @pytest.mark.slow
 @pytest.mark.long
 def test_an_evaluation_survives_a_node(nodes: Nodes, cluster: Executor, tmp_path: Path) -> None:
-    trials = (Trials((Conditions(0.4),), 600),)
+    trials = (Trials((Conditions(Mix(0.4)),), 600),)
     here, there = (EvaluateJob("oracle", None, 0, trials, tmp_path / name) for name in ("here", "there"))
     Local(1).run([here], progress=False)
     with meanwhile(lambda: cluster.run([there], progress=False)):

@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from tint_sumo.config import PolicySettings, PpoSettings
+from tint_sumo.config import Mix, PolicySettings, PpoSettings
 from tint_sumo.methods import training
 
 METHOD, STEPS, SEED = "no_labels", 64 * 40, 0
@@ -18,4 +18,4 @@ SETTINGS = PpoSettings(
 
 if __name__ == "__main__":
     training.CHECKPOINT_INTERVAL_S = 0.0
-    training.train_policy(METHOD, 0.4, STEPS, SEED, Path(sys.argv[1]), settings=SETTINGS)
+    training.train_policy(METHOD, Mix(0.4), STEPS, SEED, Path(sys.argv[1]), settings=SETTINGS)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.bombs import BOMBS, bomb
 from tint_sumo import traits
-from tint_sumo.config import ALL_MIXES, PpoSettings, ends
+from tint_sumo.config import ALL_MIXES, Mix, PpoSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.methods import loading
 from tint_sumo.methods.evaluation import evaluate
@@ -26,8 +26,8 @@ from tint_sumo.traits.storage import save
 def runs(tmp_path_factory: pytest.TempPathFactory, tiny: PpoSettings, encoders: Path) -> Path:
     """Folders of two finished trainings."""
     out = tmp_path_factory.mktemp("runs")
-    train_policy("no_labels", (0.1, 0.9), 64, 0, out / "no_labels", settings=tiny, with_zip=True)
-    train_policy("vae", 0.6, 64, 0, out / "vae", settings=tiny, traits=encoders / "vae.safetensors")
+    train_policy("no_labels", Mix(0.1, 0.9), 64, 0, out / "no_labels", settings=tiny, with_zip=True)
+    train_policy("vae", Mix(0.6), 64, 0, out / "vae", settings=tiny, traits=encoders / "vae.safetensors")
     return out
 
 
@@ -78,14 +78,14 @@ def test_rules_by_name() -> None:
 def test_trained_policies_by_folder_and_by_file(run: Path, path: str) -> None:
     contender = load_policy(run / path)
     assert contender.name == str(run / path)
-    assert contender.p_conservative == (0.1, 0.9)
+    assert contender.p_conservative == ALL_MIXES
     assert contender.source is not None and isinstance(contender.source(), NoTraits)
 
 
 def test_a_policy_drives_in_the_world_it_is_asked_to(run_with_traits: Path) -> None:
     contender = load_policy(run_with_traits)
     assert contender.source is not None and isinstance(contender.source(), EncoderTraits)
-    world = {"p_conservative": (0.1, 0.9), "position_noise_m": 0.1, "tau_s": 1.5, "time_limit_s": 3.0}
+    world = {"p_conservative": ALL_MIXES, "position_noise_m": 0.1, "tau_s": 1.5, "time_limit_s": 3.0}
     found = evaluate(contender.policy, lambda num_envs: contender.make_venv(num_envs, **world), 3, 0)
     assert len(found.cases) == 3
 
@@ -102,13 +102,13 @@ def test_a_policy_drives_in_the_scene_of_its_training_unless_another_one_is_aske
 
 
 def test_a_folder_that_is_called_like_a_rule_is_still_reached_by_path(run: Path) -> None:
-    assert load_policy(run.rename(run.with_name("ttc"))).p_conservative == (0.1, 0.9)
+    assert load_policy(run.rename(run.with_name("ttc"))).p_conservative == ALL_MIXES
 
 
 def test_shipped_policies_by_name(shelf: Path) -> None:
     assert shipped_policies() == ["no_labels", "vae"]  # in the order of the methods
     contender = load_policy("vae")
-    assert (contender.name, ends(contender.p_conservative)) == ("vae", (0.6, 0.6))
+    assert (contender.name, contender.p_conservative) == ("vae", Mix(0.6))
     assert find_policy("vae") == shelf / "vae"
 
 
@@ -249,7 +249,7 @@ def test_malicious_files_beside_a_sound_policy_are_not_touched(run: Path, tmp_pa
     marker = tmp_path / "marker"
     for name in ("policy.zip", "policy.pkl", "policy.pt", "checkpoint.zip", "run.json", "traits.json"):
         (run / name).write_bytes(bomb(kind, marker))
-    assert load_policy(run).p_conservative == load_policy(run / "policy.safetensors").p_conservative == (0.1, 0.9)
+    assert load_policy(run).p_conservative == load_policy(run / "policy.safetensors").p_conservative == ALL_MIXES
     assert not marker.exists()
 
 

@@ -23,7 +23,7 @@ from tests.bombs import BOMBS, bomb
 from tests.methods import runs
 from tests.simulation.scenes import T
 from tint_sumo import traits
-from tint_sumo.config import PolicySettings, PpoSettings, TraitSettings
+from tint_sumo.config import Mix, PolicySettings, PpoSettings, TraitSettings
 from tint_sumo.core.checkpoints import CHECKPOINT_FILE, PICKLES
 from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import DivergedError, InputError
@@ -87,7 +87,7 @@ def observed(source_of: Path, num_envs: int = 16) -> Any:
 def test_a_run_leaves_a_policy_its_card_its_snapshots_and_its_curve(tmp_path: Path, brief: PpoSettings) -> None:
     out = tmp_path / "run"
     told: list[Progress] = []
-    policy = train_policy("no_labels", (0.25, 0.5), 250, 3, out, settings=brief, report=told.append)
+    policy = train_policy("no_labels", Mix(0.25, 0.5), 250, 3, out, settings=brief, report=told.append)
     assert policy == out / "policy.safetensors"
     assert [one.done for one in told] == [0, 64, 128, 192, 250], "rollouts have 64 steps"
     assert all((one.total, one.unit) == (250, "step") for one in told)
@@ -103,7 +103,7 @@ def test_a_run_leaves_a_policy_its_card_its_snapshots_and_its_curve(tmp_path: Pa
 
 def test_the_log_and_the_curve_tell_the_outcomes_of_recent_episodes(tmp_path: Path, brief: PpoSettings) -> None:
     told: list[Progress] = []
-    train_policy("oracle", 0.4, 256, 0, tmp_path, settings=brief, report=told.append)
+    train_policy("oracle", Mix(0.4), 256, 0, tmp_path, settings=brief, report=told.append)
     curve = pd.read_csv(tmp_path / CURVE_FILE)
     assert list(curve) == ["decisions", "success", "timeout", "collision"]
     assert curve["decisions"].tolist() == [64, 128, 192, 256]
@@ -114,33 +114,33 @@ def test_the_log_and_the_curve_tell_the_outcomes_of_recent_episodes(tmp_path: Pa
 
 
 def test_snapshots_are_the_policies_after_parts_of_the_training(tmp_path: Path, tiny: PpoSettings) -> None:
-    policy = train_policy("oracle", 0.4, 512, 0, tmp_path, settings=tiny)
+    policy = train_policy("oracle", Mix(0.4), 512, 0, tmp_path, settings=tiny)
     quarter, half = (tmp_path / f"policy-{percent}.safetensors" for percent in (25, 50))
     assert [read_policy_card(one.with_suffix(""))["decisions"] for one in (quarter, half)] == [128, 256]
     for one in (quarter, half):
         assert not same(weights(one), weights(policy))
         contender = load_policy(one)
-        assert contender.p_conservative == (0.4, 0.4)
+        assert contender.p_conservative == Mix(0.4)
         actions, _ = contender.policy.predict(observed(one), deterministic=True)
         assert actions.shape == (16,)
     assert not same(weights(quarter), weights(half))
 
 
 def test_a_run_of_a_single_rollout_has_snapshots_too(tmp_path: Path, tiny: PpoSettings) -> None:
-    policy = train_policy("oracle", 0.4, 10, 0, tmp_path, settings=tiny)
+    policy = train_policy("oracle", Mix(0.4), 10, 0, tmp_path, settings=tiny)
     assert all(same(weights(tmp_path / f"policy-{percent}.safetensors"), weights(policy)) for percent in (25, 50))
 
 
 def test_a_finished_run_is_not_repeated(tmp_path: Path, tiny: PpoSettings) -> None:
-    first = train_policy("oracle", 0.4, 64, 0, tmp_path / "run", settings=tiny)
+    first = train_policy("oracle", Mix(0.4), 64, 0, tmp_path / "run", settings=tiny)
     written = first.stat().st_mtime_ns
-    assert train_policy("oracle", 0.4, 64, 0, tmp_path / "run", settings=tiny) == first
+    assert train_policy("oracle", Mix(0.4), 64, 0, tmp_path / "run", settings=tiny) == first
     assert first.stat().st_mtime_ns == written
 
 
 def test_the_seed_decides(tmp_path: Path, tiny: PpoSettings) -> None:
     one, again, other = (
-        weights(train_policy("oracle", 0.4, 64, seed, tmp_path / name, settings=tiny))
+        weights(train_policy("oracle", Mix(0.4), 64, seed, tmp_path / name, settings=tiny))
         for name, seed in (("one", 0), ("again", 0), ("other", 1))
     )
     assert same(one, again)
@@ -158,7 +158,7 @@ def test_a_loaded_policy_acts_as_the_trained_one(
         return original(model, *args, **kwargs)
 
     monkeypatch.setattr(RecurrentPPO, "learn", learn)
-    train_policy("oracle", 0.4, 64, 0, tmp_path, settings=tiny)
+    train_policy("oracle", Mix(0.4), 64, 0, tmp_path, settings=tiny)
     observation = observed(tmp_path)
     assert set(observation) == {"ego", "vehicles", "mask", "traits"}
     actions, (states,) = load_policy(tmp_path).policy.predict(observation, deterministic=True)
@@ -168,7 +168,7 @@ def test_a_loaded_policy_acts_as_the_trained_one(
 
 
 def test_decisions_can_last_several_steps(tmp_path: Path, tiny: PpoSettings) -> None:
-    train_policy("oracle", 0.4, 64, 0, tmp_path, settings=replace(tiny, action_repeat=5))
+    train_policy("oracle", Mix(0.4), 64, 0, tmp_path, settings=replace(tiny, action_repeat=5))
     contender = load_policy(tmp_path)
     venv = contender.make_venv(2, p_conservative=0.4)
     venv.seed(0)
@@ -184,14 +184,14 @@ def test_decisions_can_last_several_steps(tmp_path: Path, tiny: PpoSettings) -> 
 def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, brief: PpoSettings) -> None:
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        train_policy("oracle", 0.4, 512, 0, out, settings=brief, report=interrupt_at(256))
+        train_policy("oracle", Mix(0.4), 512, 0, out, settings=brief, report=interrupt_at(256))
     assert files(out) == [CHECKPOINT_FILE, CURVE_FILE, *SNAPSHOTS[:2], "run.json"]
     with pytest.raises(InputError, match="not finished"):
         load_policy(out)
-    assert load_policy(out / "policy-25").p_conservative == (0.4, 0.4)
+    assert load_policy(out / "policy-25").p_conservative == Mix(0.4)
     kept = (out / "policy-25.safetensors").stat().st_mtime_ns
     told: list[Progress] = []
-    train_policy("oracle", 0.4, 512, 0, out, settings=brief, report=told.append)
+    train_policy("oracle", Mix(0.4), 512, 0, out, settings=brief, report=told.append)
     assert [one.done for one in told] == [192, 256, 320, 384, 448, 512], "what nothing was learnt from is repeated"
     assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
     assert (out / "policy-25.safetensors").stat().st_mtime_ns == kept
@@ -200,8 +200,8 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, brief: PpoSetti
 
 def test_a_resumed_run_learns_as_often_as_one_at_a_stretch(tmp_path: Path, tiny: PpoSettings) -> None:
     with pytest.raises(KeyboardInterrupt):
-        train_policy("oracle", 0.4, 256, 0, tmp_path, settings=tiny, report=interrupt_at(128))
-    train_policy("oracle", 0.4, 256, 0, tmp_path, settings=tiny, with_zip=True)
+        train_policy("oracle", Mix(0.4), 256, 0, tmp_path, settings=tiny, report=interrupt_at(128))
+    train_policy("oracle", Mix(0.4), 256, 0, tmp_path, settings=tiny, with_zip=True)
     model = RecurrentPPO.load(tmp_path / ZIP_FILE)
     assert (model.num_timesteps, model._n_updates) == (256, 4)
 
@@ -209,8 +209,8 @@ def test_a_resumed_run_learns_as_often_as_one_at_a_stretch(tmp_path: Path, tiny:
 def test_a_run_may_be_interrupted_again_and_again(tmp_path: Path, brief: PpoSettings) -> None:
     for steps in (64, 128, 128, 192):
         with pytest.raises(KeyboardInterrupt):
-            train_policy("oracle", 0.4, 256, 0, tmp_path, settings=brief, report=interrupt_at(steps))
-    train_policy("oracle", 0.4, 256, 0, tmp_path, settings=brief)
+            train_policy("oracle", Mix(0.4), 256, 0, tmp_path, settings=brief, report=interrupt_at(steps))
+    train_policy("oracle", Mix(0.4), 256, 0, tmp_path, settings=brief)
     assert pd.read_csv(tmp_path / CURVE_FILE)["decisions"].tolist() == [64, 128, 192, 256]
 
 
@@ -232,7 +232,7 @@ def test_an_interrupted_run_ends_with_the_very_same_policy(method: str, tmp_path
     """
     settings = replace(tiny, time_limit_s=10.0)
     at_a_stretch, resumed = tmp_path / "at_a_stretch", tmp_path / "resumed"
-    train = partial(train_policy, method, (0.1, 0.9), 512, 0, settings=settings)
+    train = partial(train_policy, method, Mix(0.1, 0.9), 512, 0, settings=settings)
     train(at_a_stretch)
     for steps in (128, 256, 384):
         with pytest.raises(KeyboardInterrupt):
@@ -249,7 +249,7 @@ def test_a_training_leaves_the_random_numbers_and_threads_of_the_process_alone(
         expected = draw()
     torch.set_num_threads(2)
     try:
-        train_policy("vae", 0.4, 64, 0, tmp_path, settings=tiny, traits=encoders / "vae.safetensors", film=look)
+        train_policy("vae", Mix(0.4), 64, 0, tmp_path, settings=tiny, traits=encoders / "vae.safetensors", film=look)
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(1)
@@ -257,7 +257,7 @@ def test_a_training_leaves_the_random_numbers_and_threads_of_the_process_alone(
 
 
 def test_policies_are_loaded_without_random_numbers(tmp_path: Path, tiny: PpoSettings) -> None:
-    policy = train_policy("oracle", 0.4, 64, 0, tmp_path, settings=tiny, with_zip=True)
+    policy = train_policy("oracle", Mix(0.4), 64, 0, tmp_path, settings=tiny, with_zip=True)
     with preserved_random_state():
         expected = draw()
     load_policy(policy)
@@ -275,7 +275,7 @@ def test_a_run_meets_no_case_of_the_tests(tmp_path: Path, tiny: PpoSettings, mon
         return original(model, *args, **kwargs)
 
     monkeypatch.setattr(RecurrentPPO, "learn", learn)
-    train_policy("oracle", 0.4, 64, 0, tmp_path / "run", settings=tiny)
+    train_policy("oracle", Mix(0.4), 64, 0, tmp_path / "run", settings=tiny)
     assert len(set(seeds)) == 4  # environments
     assert max(seeds) < CASE_SEED
 
@@ -305,13 +305,13 @@ def test_a_killed_run_leaves_whole_files_and_goes_on(tmp_path: Path) -> None:
     assert runs.STEPS / 4 <= done < runs.STEPS
     assert pd.read_csv(out / CURVE_FILE)["decisions"].is_monotonic_increasing
     told: list[Progress] = []
-    train_policy(runs.METHOD, 0.4, runs.STEPS, runs.SEED, out, settings=runs.SETTINGS, report=told.append)
+    train_policy(runs.METHOD, Mix(0.4), runs.STEPS, runs.SEED, out, settings=runs.SETTINGS, report=told.append)
     assert told[0].done == done
     assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
     assert not list(out.rglob("*.partial"))
     assert pd.read_csv(out / CURVE_FILE)["decisions"].tolist() == list(range(64, runs.STEPS + 1, 64))
     assert all(load_policy(out / name) for name in ("policy-25", "policy-50", "policy"))
-    train_policy(runs.METHOD, 0.4, runs.STEPS, runs.SEED, tmp_path / "at_a_stretch", settings=runs.SETTINGS)
+    train_policy(runs.METHOD, Mix(0.4), runs.STEPS, runs.SEED, tmp_path / "at_a_stretch", settings=runs.SETTINGS)
     assert_same_training(out, tmp_path / "at_a_stretch")
 
 
@@ -320,14 +320,14 @@ def interrupted(tiny: PpoSettings, tmp_path_factory: pytest.TempPathFactory) -> 
     """The folder of a training with a checkpoint after two rollouts; do not write there."""
     out = tmp_path_factory.mktemp("interrupted") / "run"
     with pytest.raises(KeyboardInterrupt):
-        train_policy("vae", 0.4, 512, 0, out, settings=tiny, report=interrupt_at(192))
+        train_policy("vae", Mix(0.4), 512, 0, out, settings=tiny, report=interrupt_at(192))
     return out
 
 
 def go_on(out: Path, tiny: PpoSettings) -> str:
     """The line that refuses to go on with a training."""
     with pytest.raises(InputError) as refused:
-        train_policy("vae", 0.4, 512, 0, out, settings=tiny)
+        train_policy("vae", Mix(0.4), 512, 0, out, settings=tiny)
     assert "\n" not in str(refused.value)
     return str(refused.value)
 
@@ -402,7 +402,7 @@ def test_a_training_that_diverges_says_where_and_keeps_its_last_finite_policy(
     tmp_path: Path, tiny: PpoSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the fifth update, of one rollout each; once the cause is gone, the training goes on from there."""
-    train = partial(train_policy, "oracle", 0.4, 512, 0, settings=tiny)
+    train = partial(train_policy, "oracle", Mix(0.4), 512, 0, settings=tiny)
     updates: list[PpoLoss] = []
 
     def loss(*args: Any, **kwargs: Any) -> PpoLoss:
@@ -439,37 +439,35 @@ def test_a_film_of_a_policy_that_has_diverged_says_at_which_step(
         return contender
 
     with pytest.raises(DivergedError, match=r"^the training diverged at step \d+: .*film are not finite"):
-        train_policy("oracle", 0.4, 64, 0, tmp_path / "run", settings=tiny, film=overflow)
+        train_policy("oracle", Mix(0.4), 64, 0, tmp_path / "run", settings=tiny, film=overflow)
 
 
 # Folders and arguments
 
 
 def test_another_run_s_folder_is_refused(tmp_path: Path, tiny: PpoSettings) -> None:
-    train_policy("oracle", 0.4, 64, 0, tmp_path, settings=tiny)
+    train_policy("oracle", Mix(0.4), 64, 0, tmp_path, settings=tiny)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match=r"another run \(different: method, seed\)"):
-        train_policy("no_labels", 0.4, 64, 1, tmp_path, settings=tiny)
+        train_policy("no_labels", Mix(0.4), 64, 1, tmp_path, settings=tiny)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize(
-    ("method", "p_conservative", "steps", "seed", "message"),
+    ("method", "steps", "seed", "message"),
     [
-        ("magic", 0.4, 64, 0, "unknown method"),
-        ("ours", 0.4, 64, 0, "ours is now called vae"),
-        ("ttc", 0.4, 64, 0, "hand-written rule"),
-        ("oracle", 1.5, 64, 0, "p_conservative"),
-        ("oracle", (0.9, 0.1), 64, 0, "p_conservative"),
-        ("oracle", 0.4, 0, 0, "steps"),
-        ("oracle", 0.4, 64, -1, "seed"),
+        ("magic", 64, 0, "unknown method"),
+        ("ours", 64, 0, "ours is now called vae"),
+        ("ttc", 64, 0, "hand-written rule"),
+        ("oracle", 0, 0, "steps"),
+        ("oracle", 64, -1, "seed"),
     ],
 )
 def test_bad_values_leave_no_folder(
-    tmp_path: Path, tiny: PpoSettings, method: str, p_conservative: Any, steps: int, seed: int, message: str
+    tmp_path: Path, tiny: PpoSettings, method: str, steps: int, seed: int, message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        train_policy(method, p_conservative, steps, seed, tmp_path / "run", settings=tiny)
+        train_policy(method, Mix(0.4), steps, seed, tmp_path / "run", settings=tiny)
     assert not (tmp_path / "run").exists()
 
 
@@ -489,7 +487,7 @@ def test_what_a_method_has_no_use_for_is_refused(
     tmp_path: Path, tiny: PpoSettings, method: str, given: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        train_policy(method, 0.4, 64, 0, tmp_path / "run", **{"settings": tiny, **given})
+        train_policy(method, Mix(0.4), 64, 0, tmp_path / "run", **{"settings": tiny, **given})
     assert not (tmp_path / "run").exists()
 
 
@@ -497,7 +495,7 @@ def test_what_a_method_has_no_use_for_is_refused(
 
 
 def test_the_trait_model_travels_with_the_policy(tmp_path: Path, tiny: PpoSettings, trait_model: Path) -> None:
-    policy = train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
+    policy = train_policy("vae", Mix(0.4), 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
     trait_model.unlink()
     moved = (tmp_path / "run").rename(tmp_path / "moved")
     for path in (moved, moved / policy.name, moved / "policy-25"):
@@ -509,22 +507,22 @@ def test_the_trait_model_travels_with_the_policy(tmp_path: Path, tiny: PpoSettin
 
 
 def test_another_trait_model_is_another_run(tmp_path: Path, tiny: PpoSettings, trait_model: Path) -> None:
-    train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
+    train_policy("vae", Mix(0.4), 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
     save(traits.TRAIT_METHODS["vae"](SMALL_VAE), trait_model.with_suffix(""), {})
     with pytest.raises(InputError, match=r"another run \(different: traits\)"):
-        train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
+        train_policy("vae", Mix(0.4), 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
 
 
 def test_a_trait_model_of_another_latent_size_is_refused(tmp_path: Path, tiny: PpoSettings) -> None:
     save(traits.TRAIT_METHODS["vae"](SMALL_VAE, latent_size=3), tmp_path / "wide", {})
     with pytest.raises(InputError, match="3 latents where 2 are needed"):
-        train_policy("vae", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=tmp_path / "wide.safetensors")
+        train_policy("vae", Mix(0.4), 64, 0, tmp_path / "run", settings=tiny, traits=tmp_path / "wide.safetensors")
     assert not (tmp_path / "run").exists()
 
 
 def test_a_trait_model_that_cannot_stream_is_refused(tmp_path: Path, tiny: PpoSettings, trait_model: Path) -> None:
     with pytest.raises(InputError, match="streaming needs the posteriors of a cross_window model, not of vae"):
-        train_policy("streaming", 0.4, 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
+        train_policy("streaming", Mix(0.4), 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
     assert not (tmp_path / "run").exists()
 
 
@@ -532,7 +530,7 @@ def test_a_trait_model_that_cannot_stream_is_refused(tmp_path: Path, tiny: PpoSe
 
 
 def test_without_attention_there_are_no_scores(tmp_path: Path, tiny: PpoSettings, encoders: Path) -> None:
-    policy = train_policy("no_attention", 0.4, 64, 0, tmp_path, settings=tiny, traits=encoders / "vae.safetensors")
+    policy = train_policy("no_attention", Mix(0.4), 64, 0, tmp_path, settings=tiny, traits=encoders / "vae.safetensors")
     assert not any(".score." in name for name in weights(policy))
     assert read_policy_card(tmp_path / "policy")["settings"]["policy"]["attention"] is False
 
@@ -542,7 +540,7 @@ def test_a_critic_that_sees_true_traits_is_trained_and_the_policy_drives_without
 ) -> None:
     settings = replace(tiny, n_steps=32)
     train_policy(
-        "streaming_critic", 0.4, 128, 0, tmp_path, settings=settings, traits=encoders / "cross_window.safetensors"
+        "streaming_critic", Mix(0.4), 128, 0, tmp_path, settings=settings, traits=encoders / "cross_window.safetensors"
     )
     assert read_policy_card(tmp_path / "policy")["network"] | {"settings": None} == {
         "settings": None,
@@ -561,7 +559,7 @@ def test_a_critic_that_sees_true_traits_is_trained_and_the_policy_drives_without
 def test_what_the_critic_sees_is_learnt_from(tmp_path: Path, tiny: PpoSettings, encoders: Path) -> None:
     settings = replace(tiny, learning_rate=1e-2)
     train_policy(
-        "streaming_critic", 0.4, 256, 0, tmp_path, settings=settings, traits=encoders / "cross_window.safetensors"
+        "streaming_critic", Mix(0.4), 256, 0, tmp_path, settings=settings, traits=encoders / "cross_window.safetensors"
     )
     before, after = (weights(tmp_path / f"{name}.safetensors") for name in ("policy-25", "policy"))
     changed = {name for name in before if not torch.equal(before[name], after[name])}
@@ -572,8 +570,8 @@ def test_what_the_critic_sees_is_learnt_from(tmp_path: Path, tiny: PpoSettings, 
 def test_ma_is_trained_on_true_traits_and_drives_with_predicted_ones(
     tmp_path: Path, tiny: PpoSettings, encoders: Path
 ) -> None:
-    oracle = train_policy("oracle", 0.4, 64, 0, tmp_path / "oracle", settings=tiny)
-    ma = train_policy("ma", 0.4, 64, 0, tmp_path / "ma", settings=tiny, traits=encoders / "classifier.safetensors")
+    oracle = train_policy("oracle", Mix(0.4), 64, 0, tmp_path / "oracle", settings=tiny)
+    ma = train_policy("ma", Mix(0.4), 64, 0, tmp_path / "ma", settings=tiny, traits=encoders / "classifier.safetensors")
     assert same(weights(oracle), weights(ma))
     source = load_policy(ma).source
     assert source is not None and isinstance(source(), ClassifierTraits)
@@ -582,7 +580,7 @@ def test_ma_is_trained_on_true_traits_and_drives_with_predicted_ones(
 def test_a_shared_training_gives_the_same_actions_with_another_source(
     tmp_path: Path, tiny: PpoSettings, encoders: Path
 ) -> None:
-    train_policy("oracle", (0.1, 0.9), 128, 5, tmp_path / "oracle", settings=tiny)
+    train_policy("oracle", Mix(0.1, 0.9), 128, 5, tmp_path / "oracle", settings=tiny)
     share_training(tmp_path / "oracle", "ma", tmp_path / "ma", encoders / "classifier.safetensors")
     card = read_policy_card(tmp_path / "ma" / "policy")
     assert (card["method"], card["trained_as"], card["seed"], card["traits"]) == ("ma", "oracle", 5, "traits")
@@ -601,14 +599,14 @@ def test_a_shared_training_gives_the_same_actions_with_another_source(
 
 def test_a_training_that_is_not_finished_is_not_shared(tmp_path: Path, tiny: PpoSettings, encoders: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        train_policy("oracle", 0.4, 256, 0, tmp_path / "oracle", settings=tiny, report=interrupt_at(256))
+        train_policy("oracle", Mix(0.4), 256, 0, tmp_path / "oracle", settings=tiny, report=interrupt_at(256))
     with pytest.raises(InputError, match=r"no file .*policy\.json"):
         share_training(tmp_path / "oracle", "ma", tmp_path / "ma", encoders / "classifier.safetensors")
     assert not (tmp_path / "ma" / "policy.json").exists()
 
 
 def test_a_zip_file_is_written_on_demand_and_read_with_permission(tmp_path: Path, tiny: PpoSettings) -> None:
-    policy = train_policy("oracle", 0.4, 64, 0, tmp_path, settings=tiny, with_zip=True)
+    policy = train_policy("oracle", Mix(0.4), 64, 0, tmp_path, settings=tiny, with_zip=True)
     assert RecurrentPPO.load(tmp_path / ZIP_FILE).num_timesteps == 64
     with pytest.raises(InputError, match="a pickle, which can run any code"):
         load_policy(tmp_path / ZIP_FILE)
@@ -620,7 +618,7 @@ def test_a_zip_file_is_written_on_demand_and_read_with_permission(tmp_path: Path
 
 
 def test_a_trait_model_of_another_scene_is_refused_unless_it_is_asked_for(tmp_path: Path, tiny: PpoSettings) -> None:
-    there = partial(train_policy, "vae", 0.5, 8, 0, tmp_path / "policy", settings=tiny, scene="roundabout")
+    there = partial(train_policy, "vae", Mix(0.5), 8, 0, tmp_path / "policy", settings=tiny, scene="roundabout")
     with pytest.raises(InputError, match="vae was trained in scene t_intersection, the policy is of scene roundabout"):
         there()
     assert not (tmp_path / "policy").exists()

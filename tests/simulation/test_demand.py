@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.simulation.scenes import T
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Population
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Mix, Population, Traffic
 from tint_sumo.scenes import Scene
 from tint_sumo.scenes.drivers import members
 from tint_sumo.scenes.geometry import NO_VEHICLE
@@ -20,8 +20,8 @@ YIELDING, HASTY = 0, 1  # members: one of each profile
 POOLED = replace(T, population=replace(T.population, members=1))
 
 
-def played(p_conservative: float = 0.5, arrivals_per_s: float | None = None) -> Scene:
-    return replace(POOLED, traffic=replace(T.traffic, p_conservative=p_conservative, arrivals_per_s=arrivals_per_s))
+def played(mix: Mix | None = None, arrivals_per_s: float | None = None) -> Scene:
+    return replace(POOLED, traffic=Traffic(mix or Mix(0.5), arrivals_per_s))
 
 
 def pool(scene: Scene) -> DriverPool:
@@ -178,7 +178,7 @@ def test_a_newcomer_keeps_its_gap_to_the_back_of_the_one_before() -> None:
 
 
 def test_mixes_are_drawn_from_the_range_of_the_traffic() -> None:
-    scene = played((0.2, 0.8))  # type: ignore[arg-type]
+    scene = played(Mix(0.2, 0.8))
     demand = Demand(1, members(scene.population), layout(scene))
     drawn = []
     for seed in range(40):

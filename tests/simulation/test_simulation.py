@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.simulation.scenes import GO, LOWER, STEP_S, UPPER, T, scene
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, EgoController, Idm, Population, Traffic
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, EgoController, Idm, Mix, Population, Traffic
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SCENES, Scene, find_scene
 from tint_sumo.scenes.geometry import measure_distances_m
@@ -28,7 +28,7 @@ def state(simulation: SceneSimulation) -> dict[str, Any]:
 
 
 def in_traffic(p_conservative: float | tuple[float, float], **changes: Any) -> Scene:
-    return replace(T, traffic=Traffic(p_conservative=p_conservative), **changes)
+    return replace(T, traffic=Traffic(p_conservative=Mix.parse(p_conservative)), **changes)
 
 
 DESIRED_MPS = np.array([0.0, 0.5, 3.0])
@@ -446,7 +446,7 @@ def test_a_range_of_one_number_is_that_number(batch: SceneSimulation) -> None:
 @pytest.mark.parametrize("p", [-0.1, 1.1, float("nan")])
 def test_probabilities_outside_the_unit_interval_are_refused(p: float) -> None:
     with pytest.raises(InputError, match=r"must be a probability in \[0, 1\]"):
-        Traffic(p_conservative=p)
+        Traffic(p_conservative=Mix.parse(p))
 
 
 def test_a_scene_of_few_slots_begins_with_those_who_have_come_furthest() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.simulation.scenes import CREEP, GO, LOWER, STEM_M, STEP_S, STOP, UPPER, T, scene, speeds, stand_at, until
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Traffic
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Mix, Traffic
 from tint_sumo.scenes import SCENES, find_scene
 from tint_sumo.scenes.drivers import members
 from tint_sumo.scenes.geometry import SPACING_M
@@ -105,7 +105,7 @@ def test_only_drivers_that_can_stop_clear_of_the_egos_way_yield() -> None:
 def test_ego_and_driver_never_wait_for_each_other(name: str, p_conservative: float, hesitates: bool) -> None:
     """Nobody but standing drivers holds an ego that wants to drive for more than 3 s, at any time in any episode."""
     replicas, rng = 32, np.random.default_rng(7)
-    played = replace(find_scene(name), traffic=Traffic(p_conservative=p_conservative))
+    played = replace(find_scene(name), traffic=Traffic(Mix(p_conservative)))
     simulation = SceneSimulation(replicas, played)
     try:
         for replica in range(replicas):

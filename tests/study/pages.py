@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from tests.study.scenes import given, write_results
-from tint_sumo.config import ALL_MIXES
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.files import write_json, write_text
 from tint_sumo.methods.training import CURVE_FILE
 from tint_sumo.study.budgets import Conditions
@@ -19,7 +19,7 @@ def small_study(out: Path) -> Path:
     """Results of rules and of a shipped policy, made by hand: their episodes are real, and may end otherwise."""
     fared = {"always_go": (1, 0, 2), "ttc": (1, 0, 2), "vae": (3, 0, 0)}
     results = [
-        given(name, {Conditions(0.25): counts, Conditions(0.4): counts, **dict.fromkeys(WORLDS, counts)})
+        given(name, {Conditions(Mix(0.25)): counts, Conditions(Mix(0.4)): counts, **dict.fromkeys(WORLDS, counts)})
         for name, counts in fared.items()
     ]
     write_results(results, out)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from tint_sumo.config import ALL_MIXES, Share
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.files import write_json
 from tint_sumo.methods.evaluation import Case, Evaluation
 from tint_sumo.study.budgets import Conditions
@@ -22,7 +22,7 @@ def evaluation(success: int, timeout: int, collision: int) -> Evaluation:
 
 
 def trained(
-    method: str, seed: int, tested: dict[Conditions, tuple[int, int, int]], mix: Share | None = ALL_MIXES
+    method: str, seed: int, tested: dict[Conditions, tuple[int, int, int]], mix: Mix | None = ALL_MIXES
 ) -> Result:
     """A policy that the study trained, with so many successes, timeouts and collisions under each conditions."""
     fared = tuple(Measured(conditions, evaluation(*counts)) for conditions, counts in tested.items())

@@ -1,10 +1,18 @@
 import json
-from dataclasses import asdict
 
 import pytest
 
 from tint_sumo import traits
-from tint_sumo.config import ALL_MIXES, P_CONSERVATIVE, TRAIT_BUDGETS, Idm, PpoSettings, TraitSettings, ends, is_share
+from tint_sumo.config import (
+    ALL_MIXES,
+    P_CONSERVATIVE,
+    TRAIT_BUDGETS,
+    Idm,
+    Mix,
+    PpoSettings,
+    TraitSettings,
+)
+from tint_sumo.core.structures import plain
 from tint_sumo.methods.registry import Learned, find_method
 from tint_sumo.methods.training import SNAPSHOTS_PERCENT
 from tint_sumo.study.budgets import BUDGETS, Conditions
@@ -16,9 +24,8 @@ def test_every_budget_can_be_run(name: str) -> None:
     assert any(isinstance(find_method(method), Learned) for method in budget.methods)
     assert len(set(budget.methods)) == len(budget.methods)
     assert budget.ppo.n_minibatches <= budget.ppo.n_envs
-    assert all(map(is_share, budget.mixes))
     assert (budget.traits is None) == (budget.windows == 0), "windows are recorded for trait models alone"
-    assert json.loads(json.dumps(asdict(budget)))["seeds"] == list(budget.seeds)
+    assert json.loads(json.dumps(plain(budget)))["seeds"] == list(budget.seeds)
 
 
 @pytest.mark.parametrize("name", BUDGETS)
@@ -28,8 +35,7 @@ def test_every_policy_is_tested_somewhere_after_a_part_of_the_training_that_is_k
     assert len(set(conditions)) == len(conditions)
     assert {one.percent for one in conditions} <= {100, *SNAPSHOTS_PERCENT}
     for mix in budget.mixes:
-        low, high = ends(mix)
-        assert any(low <= ends(one.p_conservative)[0] and ends(one.p_conservative)[1] <= high for one in conditions)
+        assert any(mix.contains(one.p_conservative) for one in conditions)
 
 
 @pytest.mark.parametrize("name", BUDGETS)
@@ -43,9 +49,9 @@ def test_the_paper_s_budget_is_the_paper_s() -> None:
     paper = BUDGETS["paper"]
     assert paper.ppo == PpoSettings()
     assert paper.traits == TraitSettings()
-    assert (paper.mixes, len(paper.seeds), paper.windows) == (P_CONSERVATIVE, 3, 696_000)
+    assert (paper.mixes, len(paper.seeds), paper.windows) == (tuple(map(Mix, P_CONSERVATIVE)), 3, 696_000)
     assert [(trials.conditions, trials.episodes) for trials in paper.trials] == [
-        (tuple(Conditions(p) for p in (0.25, 0.4, 0.6)), 500)
+        (tuple(Conditions(Mix(p)) for p in (0.25, 0.4, 0.6)), 500)
     ]
 
 
@@ -69,13 +75,13 @@ def test_trait_budgets_are_networks_of_one_kind() -> None:
 @pytest.mark.parametrize(
     ("conditions", "label"),
     [
-        (Conditions(0.4), "as trained"),
+        (Conditions(Mix(0.4)), "as trained"),
         (Conditions(ALL_MIXES), "as trained"),
-        (Conditions(0.4, position_noise_m=0.05), "noise 0.05 m"),
-        (Conditions(0.4, tau_s=1.5), "tau 1.5 s"),
-        (Conditions(0.4, tau_s=Idm.tau_s), "tau 1 s"),
-        (Conditions(0.4, percent=25), "25 % of training"),
-        (Conditions(0.4, 0.1, 0.7, 50), "noise 0.1 m, tau 0.7 s, 50 % of training"),
+        (Conditions(Mix(0.4), position_noise_m=0.05), "noise 0.05 m"),
+        (Conditions(Mix(0.4), tau_s=1.5), "tau 1.5 s"),
+        (Conditions(Mix(0.4), tau_s=Idm.tau_s), "tau 1 s"),
+        (Conditions(Mix(0.4), percent=25), "25 % of training"),
+        (Conditions(Mix(0.4), 0.1, 0.7, 50), "noise 0.1 m, tau 0.7 s, 50 % of training"),
     ],
 )
 def test_conditions_are_called_by_what_differs_from_the_training(conditions: Conditions, label: str) -> None:
@@ -83,7 +89,7 @@ def test_conditions_are_called_by_what_differs_from_the_training(conditions: Con
 
 
 def test_a_headway_that_is_not_given_is_the_scene_s() -> None:
-    own, given = Conditions(0.4), Conditions(0.4, tau_s=Idm.tau_s)
+    own, given = Conditions(Mix(0.4)), Conditions(Mix(0.4), tau_s=Idm.tau_s)
     assert "tau_s" not in own.world
     assert given.world["tau_s"] == Idm.tau_s
     assert own.resolved(1.5).tau_s == 1.5
@@ -92,7 +98,6 @@ def test_a_headway_that_is_not_given_is_the_scene_s() -> None:
 
 
 def test_conditions_are_the_same_with_whole_numbers_as_with_floats() -> None:
-    whole, floats = Conditions(1, 2, 3), Conditions(1.0, 2.0, 3.0)
+    whole, floats = Conditions(Mix(0, 1), 2, 3), Conditions(Mix(0.0, 1.0), 2.0, 3.0)
     assert whole == floats and repr(whole) == repr(floats)
-    assert Conditions(1).is_single_mix and not Conditions([0, 1]).is_single_mix
-    assert repr(Conditions([0, 1])) == repr(Conditions((0.0, 1.0)))
+    assert Conditions(Mix(1)).is_single_mix and not Conditions(Mix(0, 1)).is_single_mix

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from tests.simulation.scenes import GO, LOWER, UPPER, T, scene, until
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DriverProfile
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DriverProfile, Mix
 from tint_sumo.scenes import Scene
 from tint_sumo.scenes.layout import layout
 from tint_sumo.simulation import SceneSimulation
@@ -103,22 +103,22 @@ def test_no_ego_is_faster_through_than_the_ceiling_takes_it_to_be() -> None:
 
 
 def test_nobody_gets_through_where_nobody_yields_and_everybody_where_all_do() -> None:
-    assert ceiling(0.0, 20) == 0.0
-    assert ceiling(1.0, 20) == 1.0
+    assert ceiling(Mix(0.0), 20) == 0.0
+    assert ceiling(Mix(1.0), 20) == 1.0
 
 
 def test_the_ceiling_grows_with_the_share_of_yielding_drivers() -> None:
-    found = [ceiling(p, 60) for p in (0.05, 0.1, 0.25)]
+    found = [ceiling(Mix(p), 60) for p in (0.05, 0.1, 0.25)]
     assert 0.0 < found[0] < found[1] < found[2] < 1.0
-    assert found[0] < ceiling((0.05, 0.25), 60) < 1.0
+    assert found[0] < ceiling(Mix(0.05, 0.25), 60) < 1.0
 
 
 def test_the_same_cases_have_the_same_ceiling_whatever_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    at_once = ceiling(0.1, 40)
-    assert ceiling(0.1, 40) == at_once
+    at_once = ceiling(Mix(0.1), 40)
+    assert ceiling(Mix(0.1), 40) == at_once
     monkeypatch.setattr(module, "BATCH", 12)
-    assert ceiling(0.1, 40) == at_once
+    assert ceiling(Mix(0.1), 40) == at_once
 
 
 def test_other_cases_have_another_ceiling() -> None:
-    assert len({ceiling(0.1, 40, seed) for seed in range(4)}) > 1
+    assert len({ceiling(Mix(0.1), 40, seed) for seed in range(4)}) > 1

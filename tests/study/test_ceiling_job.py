@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from tint_sumo.config import ALL_MIXES
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Progress
 from tint_sumo.methods.evaluation import CASES
@@ -13,15 +13,20 @@ from tint_sumo.study.ceiling_job import CEILINGS_FILE, CeilingJob, read_ceilings
 
 
 def test_there_is_a_ceiling_for_each_mix_of_the_training_s_world(tmp_path: Path) -> None:
-    elsewhere = (Conditions(0.9, 0.1), Conditions(0.9, percent=25), Conditions(ALL_MIXES), Conditions(0.9, tau_s=2.0))
-    tests = (budgets.Trials((Conditions(0.1), *elsewhere), 10), budgets.Trials((Conditions(0.0),), 5))
+    elsewhere = (
+        Conditions(Mix(0.9), 0.1),
+        Conditions(Mix(0.9), percent=25),
+        Conditions(ALL_MIXES),
+        Conditions(Mix(0.9), tau_s=2.0),
+    )
+    tests = (budgets.Trials((Conditions(Mix(0.1)), *elsewhere), 10), budgets.Trials((Conditions(Mix(0.0)),), 5))
     job = CeilingJob(tests, tmp_path)
     assert not job.is_done()
     told: list[Progress] = []
     line = job.run(told.append)
     assert job.is_done()
     assert told == [Progress(0, 15, "case"), Progress(10, 15, "case")]
-    expected = ceiling(0.1, 10, CASES)
+    expected = ceiling(Mix(0.1), 10, CASES)
     assert read_ceilings(tmp_path) == {0.1: expected, 0.0: 0.0}
     assert line == f"P 0.1: {expected:.1%}, P 0: 0.0%"
 

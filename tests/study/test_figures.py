@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from tests.study.scenes import given, trained
-from tint_sumo.config import ALL_MIXES
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.methods.registry import METHODS
 from tint_sumo.study import figures
@@ -25,7 +25,7 @@ WORLDS = (
     *(Conditions(ALL_MIXES, tau_s=tau_s) for tau_s in (0.7, 1.5)),
     *(Conditions(ALL_MIXES, percent=percent) for percent in (25, 50)),
 )
-MIXES = tuple(Conditions(p) for p in (0.1, 0.25, 0.4, 0.9))
+MIXES = tuple(Conditions(Mix(p)) for p in (0.1, 0.25, 0.4, 0.9))
 ROWS = tabulate(
     [
         *(trained("oracle", seed, dict.fromkeys((*MIXES, *WORLDS), (8 + seed, 1, 1 - seed))) for seed in (0, 1)),
@@ -86,13 +86,13 @@ def test_the_paper_s_success_is_marked_where_there_is_one(tmp_path: Path, drawn:
 
 
 def test_no_label_of_a_bar_rounds_to_all_or_to_the_even_number(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
-    rows = tabulate([given("ttc", {Conditions(0.25): (199, 1, 0), Conditions(0.4): (197, 3, 0)})])
+    rows = tabulate([given("ttc", {Conditions(Mix(0.25)): (199, 1, 0), Conditions(Mix(0.4)): (197, 3, 0)})])
     plot_bars(rows, tmp_path / "bars.png")
     assert [text.get_text() for axes in drawn().axes for text in axes.texts] == ["99.5", "98.5"]
 
 
 def test_a_single_bar_is_a_figure_too(tmp_path: Path) -> None:
-    rows = tabulate([given("always_go", {Conditions(0.4): (0, 0, 3)})])
+    rows = tabulate([given("always_go", {Conditions(Mix(0.4)): (0, 0, 3)})])
     assert_picture(plot_bars(rows, tmp_path / "bars.png"))
 
 
@@ -135,7 +135,7 @@ def test_worlds_have_a_panel_for_each_condition_through_the_training_s_world(
 
 
 def test_methods_of_the_past_are_drawn_under_their_names(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
-    rows = tabulate([trained("forgotten", 0, {AS_TRAINED: (1, 1, 0), Conditions(0.4): (1, 1, 0)})])
+    rows = tabulate([trained("forgotten", 0, {AS_TRAINED: (1, 1, 0), Conditions(Mix(0.4)): (1, 1, 0)})])
     assert_picture(plot_worlds(over_all_mixes(rows), tmp_path / "worlds.png"))
     assert [container.get_label() for container in drawn().axes[0].containers] == ["forgotten"]
     plot_bars(at_mixes(rows), tmp_path / "bars.png")

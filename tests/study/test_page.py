@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.study.scenes import given, trained, write_results
-from tint_sumo.config import ALL_MIXES
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
 from tint_sumo.core.progress import silent
@@ -69,16 +69,16 @@ def test_however_often_policies_fail_the_number_of_cases_is_bounded() -> None:
 
 def test_the_middle_mix_that_most_policies_met_is_shown_with_first_seeds() -> None:
     counts = (3, 1, 1)
-    mixes = {Conditions(p): counts for p in (0.1, 0.25, 0.4, 0.6, 0.9)}
+    mixes = {Conditions(Mix(p)): counts for p in (0.1, 0.25, 0.4, 0.6, 0.9)}
     rows = tabulate(
         [
-            given("ttc", {**mixes, Conditions(0.5): counts, Conditions(ALL_MIXES): counts}),
+            given("ttc", {**mixes, Conditions(Mix(0.5)): counts, Conditions(ALL_MIXES): counts}),
             *(trained("oracle", seed, mixes) for seed in (3, 4)),
             given("oracle", mixes),
         ]
     )
     choice = choose(rows)
-    assert choice.conditions == Conditions(0.4)
+    assert choice.conditions == Conditions(Mix(0.4))
     assert [one.label for one in choice.policies] == ["ttc", "oracle-shipped", "oracle-P0.1to0.9-seed3"]
     only_worlds = choose(tabulate([given("ttc", {Conditions(ALL_MIXES, 0.1): counts})]))
     assert only_worlds.conditions == Conditions(ALL_MIXES, 0.1)
@@ -150,7 +150,7 @@ def test_rules_have_no_value_no_attention_and_nothing_inferred() -> None:
 
 
 def test_recordings_tell_the_case_and_are_made_once_for_a_policy_and_its_cases(tmp_path: Path) -> None:
-    recording = Recording("always_go", None, 0, Conditions(0.4), (2, 0), tmp_path)
+    recording = Recording("always_go", None, 0, Conditions(Mix(0.4)), (2, 0), tmp_path)
     job = RecordJob(0, (recording,), tmp_path)
     assert not job.is_done()
     assert job.run(silent) == "policies: 1"
@@ -162,7 +162,7 @@ def test_recordings_tell_the_case_and_are_made_once_for_a_policy_and_its_cases(t
     written = recording.file.read_bytes()
     assert job.is_done() and job.run(silent) == "policies: 0"
     other = replace(recording, cases=(0,))
-    assert not other.is_done() and not replace(recording, conditions=Conditions(0.6)).is_done()
+    assert not other.is_done() and not replace(recording, conditions=Conditions(Mix(0.6))).is_done()
     recording.file.unlink()
     recording.make(silent)
     assert recording.file.read_bytes() == written
@@ -193,7 +193,7 @@ def test_the_roads_of_every_scene_lie_in_its_picture(name: str) -> None:
 
 
 def test_charts_and_their_tables_tell_the_rates_and_intervals() -> None:
-    rows = tabulate([trained("oracle", seed, {Conditions(0.4): (8 + seed, 2 - seed, 0)}) for seed in (0, 1)])
+    rows = tabulate([trained("oracle", seed, {Conditions(Mix(0.4)): (8 + seed, 2 - seed, 0)}) for seed in (0, 1)])
     chart = outcome_chart(rows, "success")
     (trace,) = chart.figure["data"]
     low, high = rows[0].intervals["success"]
@@ -264,7 +264,7 @@ def section(page: str, name: str) -> str:
 def bare(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The page of a study whose policies are gone, and that tested in one other world alone."""
     out = tmp_path_factory.mktemp("bare")
-    counts = {Conditions(0.4): (18, 1, 1)}
+    counts = {Conditions(Mix(0.4)): (18, 1, 1)}
     write_results([trained("oracle", 0, counts), trained("no_labels", 0, counts)], out)
     report = write_page(write_report(out), out, progress=False)
     assert report.page_file == out / "report.html"
@@ -316,7 +316,7 @@ def test_what_came_out_is_told_of_the_mixes_that_all_methods_met(results: dict[s
     rows = tabulate(
         [
             (given if name == "ttc" else partial(trained, seed=0))(
-                name, tested={Conditions(p): counts for p, counts in fared.items()}
+                name, tested={Conditions(Mix.parse(p)): counts for p, counts in fared.items()}
             )
             for name, fared in results.items()
         ]
@@ -331,13 +331,14 @@ def test_failures_are_listed_folded_and_only_where_there_are_any() -> None:
     good = recorded("good", outcomes("ss"), "success")
     bad = recorded("bad", outcomes("cs"), "collision")
     unlucky = recorded("unlucky", outcomes("sc"), "success")  # its failure is none of the recorded cases
-    lists = failure_lists(Recordings("t_intersection", Choice(Conditions(0.4), (), (0,)), (good, bad, unlucky), ()))
+    choice = Choice(Conditions(Mix(0.4)), (), (0,))
+    lists = failure_lists(Recordings("t_intersection", choice, (good, bad, unlucky), ()))
     assert "good" not in lists
     assert re.findall("<details><summary>(.*?)</summary>", lists) == [
         "bad: 1 collision and 0 timeouts in 2 cases; 1 of them recorded"
     ]
     assert "<p>unlucky: 1 collision and 0 timeouts in 2 cases; 0 of them recorded</p>" in lists
-    assert failure_lists(Recordings("t_intersection", Choice(Conditions(0.4), (), (0,)), (good,), ())) == ""
+    assert failure_lists(Recordings("t_intersection", choice, (good,), ())) == ""
 
 
 def test_the_page_leads_nowhere_else_and_is_small(bare: str) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from tint_sumo.comparisons.sweep import Sweep
 from tint_sumo.comparisons.traits import TraitStudy
-from tint_sumo.config import ALL_MIXES, Idm, PolicySettings, PpoSettings, TraitSettings
+from tint_sumo.config import ALL_MIXES, Idm, Mix, PolicySettings, PpoSettings, TraitSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.registry import Learned, find_method
@@ -21,7 +21,7 @@ from tint_sumo.study.results import read_results
 from tint_sumo.study.trait_job import TraitJob
 
 POLICIES = ("oracle-P0.4-seed0", "ma-P0.4-seed0")
-AT_MIX, HALF, ELSEWHERE = Conditions(0.4), Conditions(0.4, percent=50), Conditions(0.9)
+AT_MIX, HALF, ELSEWHERE = Conditions(Mix(0.4)), Conditions(Mix(0.4), percent=50), Conditions(Mix(0.9))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def budget(brief: PpoSettings) -> Budget:
         traits=traits,
         ppo=brief,
         methods=("always_go", "ma", "oracle"),
-        mixes=(0.4,),
+        mixes=(Mix(0.4),),
         seeds=(0,),
         trials=(Trials((AT_MIX, HALF), 3), Trials((ELSEWHERE,), 2)),
     )
@@ -53,11 +53,11 @@ def times(out: Path) -> dict[str, int]:
 
 
 def test_a_headway_that_is_the_scene_s_is_planned_like_one_that_is_not_given(tmp_path: Path) -> None:
-    given = tuple(Trials((Conditions(0.4, tau_s=tau_s),), 1) for tau_s in (1.0, 1.5))
+    given = tuple(Trials((Conditions(Mix(0.4), tau_s=tau_s),), 1) for tau_s in (1.0, 1.5))
     scene = find_scene("four_way")
     slow = replace(scene, name="slow", population=replace(scene.population, idm=Idm(tau_s=1.5)))
     jobs = plan(replace(BUDGETS["quick"], trials=given), tmp_path, slow)
-    planned = tuple(Trials((one,), 1) for one in (Conditions(0.4, tau_s=1.0), Conditions(0.4)))
+    planned = tuple(Trials((one,), 1) for one in (Conditions(Mix(0.4), tau_s=1.0), Conditions(Mix(0.4))))
     tests = [job for job in jobs if isinstance(job, EvaluateJob | CeilingJob)]
     assert tests and all(job.trials == planned for job in tests)
 
@@ -180,7 +180,7 @@ def test_a_study_refuses_settings_that_none_of_its_stages_uses(tmp_path: Path) -
 
 
 def test_ma_needs_the_oracle_s_training_with_the_same_seed_and_mix(tmp_path: Path, budget: Budget) -> None:
-    jobs = plan(replace(budget, mixes=(0.4, ALL_MIXES), seeds=(0, 1)), tmp_path)
+    jobs = plan(replace(budget, mixes=(Mix(0.4), ALL_MIXES), seeds=(0, 1)), tmp_path)
     needs = {job.name: job.needs for job in jobs if isinstance(job, TrainJob) and job.method == "ma"}
     assert needs == {
         f"train ma-{which}": ("traits classifier", f"train oracle-{which}")

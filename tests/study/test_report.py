@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from tests.study.scenes import given, trained, write_results
-from tint_sumo.config import ALL_MIXES
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_json, write_text
 from tint_sumo.core.statistics import Rate, difference_interval, rate_interval
@@ -27,8 +27,8 @@ def policy(method: str, seed: int, success: int) -> Result:
     """A policy with so many successes of 20 cases among P 0.4, and fewer elsewhere."""
     timeout, collision = 1, 19 - success
     tested = {
-        Conditions(0.25): (success - 2, timeout, collision + 2),
-        Conditions(0.4): (success, timeout, collision),
+        Conditions(Mix(0.25)): (success - 2, timeout, collision + 2),
+        Conditions(Mix(0.4)): (success, timeout, collision),
         WORLD: (success - 1, timeout, collision + 1),
         NOISY: (success - 3, timeout, collision + 3),
         HALF: (success - 4, timeout, collision + 4),
@@ -40,9 +40,9 @@ SEVERAL_SEEDS = [
     *(policy("oracle", seed, success) for seed, success in enumerate((19, 18, 19))),
     *(policy("no_labels", seed, success) for seed, success in enumerate((8, 7, 6))),
     *(policy("vae", seed, success) for seed, success in enumerate((15, 12, 14))),
-    given("always_go", {Conditions(0.4): (0, 0, 20), WORLD: (0, 0, 20)}),
+    given("always_go", {Conditions(Mix(0.4)): (0, 0, 20), WORLD: (0, 0, 20)}),
 ]
-ONE_SEED = [policy("oracle", 0, 18), given("ttc", {Conditions(0.25): (5, 4, 1), Conditions(0.6): (9, 1, 0)})]
+ONE_SEED = [policy("oracle", 0, 18), given("ttc", {Conditions(Mix(0.25)): (5, 4, 1), Conditions(Mix(0.6)): (9, 1, 0)})]
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def report(study: Path) -> StudyReport:
 
 
 def row_at(report: StudyReport, method: str, p_conservative: float) -> Row:
-    return next(row for row in report.rows if (row.method, row.conditions) == (method, Conditions(p_conservative)))
+    return next(row for row in report.rows if (row.method, row.conditions) == (method, Conditions(Mix(p_conservative))))
 
 
 def tables(markdown: str) -> dict[str, list[list[str]]]:
@@ -210,7 +210,7 @@ def test_differences_are_to_the_oracle_and_to_no_labels_with_intervals(report: S
 
 
 def test_methods_that_did_not_meet_the_same_cases_are_not_compared() -> None:
-    fewer = [trained("vae", seed, {Conditions(0.4): (4, 0, 1)}) for seed in range(2)]
+    fewer = [trained("vae", seed, {Conditions(Mix(0.4)): (4, 0, 1)}) for seed in range(2)]
     rows = tabulate([*SEVERAL_SEEDS[:3], *fewer])
     (line,) = tables(to_markdown(result_tables(rows, {})))["Differences in success"][1:]
     assert line == ["paper's method", "oracle", "-", "-"]

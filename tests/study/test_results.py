@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.study.scenes import given, trained, write_results
-from tint_sumo.config import ALL_MIXES, Idm
+from tint_sumo.config import ALL_MIXES, Idm, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.methods.evaluation import TUNING_CASES
 from tint_sumo.study.budgets import Conditions
@@ -15,9 +15,9 @@ from tint_sumo.study.report import write_report
 from tint_sumo.study.results import Result, read_results
 
 SOME_RESULTS = [
-    trained("oracle", 1, {Conditions(0.4): (8, 1, 1), Conditions(ALL_MIXES, 0.05, 0.7, 25): (3, 0, 2)}),
-    trained("vae", 0, {Conditions(0.25): (1, 0, 0)}, mix=0.25),
-    given("ttc", {Conditions(0.25): (0, 0, 3)}),
+    trained("oracle", 1, {Conditions(Mix(0.4)): (8, 1, 1), Conditions(ALL_MIXES, 0.05, 0.7, 25): (3, 0, 2)}),
+    trained("vae", 0, {Conditions(Mix(0.25)): (1, 0, 0)}, mix=Mix(0.25)),
+    given("ttc", {Conditions(Mix(0.25)): (0, 0, 3)}),
 ]
 
 
@@ -46,7 +46,7 @@ def test_a_file_says_how_the_policy_fared_without_a_look_at_the_cases(study: Pat
 
 
 def test_a_file_tells_the_headway_of_the_scene_where_none_was_given(tmp_path: Path) -> None:
-    tested = {Conditions(0.4): (8, 1, 1), Conditions(0.4, tau_s=1.0): (1, 0, 0)}
+    tested = {Conditions(Mix(0.4)): (8, 1, 1), Conditions(Mix(0.4), tau_s=1.0): (1, 0, 0)}
     result = replace(trained("oracle", 0, tested), scene_tau_s=1.5)
     file = write_results([result], tmp_path) / RESULTS / "0.json"
     assert [one["tau_s"] for one in json.loads(file.read_text())["tested"]] == [1.5, 1.0]
@@ -62,7 +62,7 @@ def test_a_file_without_the_scene_s_headway_is_of_drivers_with_the_default_one(s
 
 
 def test_a_policy_that_no_test_is_for_has_no_cases(tmp_path: Path) -> None:
-    untested = trained("oracle", 0, {}, mix=0.25)
+    untested = trained("oracle", 0, {}, mix=Mix(0.25))
     assert read_results(write_results([untested], tmp_path)) == [untested]
 
 
@@ -111,7 +111,7 @@ def test_results_with_a_part_missing_are_named(study: Path, entry: str) -> None:
         {"cases": None},
         {"p_conservative": None},
         {"p_conservative": []},
-        {"p_conservative": [0.1]},
+        {"p_conservative": [0.1, 0.5, 0.9]},
         {"p_conservative": "many"},
         {"tau_s": None},
         {"percent": "all"},

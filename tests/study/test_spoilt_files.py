@@ -12,7 +12,7 @@ import pytest
 from tests.study.scenes import trained
 from tint_sumo import traits
 from tint_sumo.comparisons import traits_report
-from tint_sumo.config import ALL_MIXES
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import RUN_FILE, claim_folder, shipped, write_json
 from tint_sumo.core.progress import silent
@@ -82,7 +82,7 @@ def test_ceilings(tmp_path: Path) -> None:
 
 
 def test_recorded_episodes(tmp_path: Path) -> None:
-    recording = Recording("always_go", None, 0, Conditions(0.4), (0,), tmp_path)
+    recording = Recording("always_go", None, 0, Conditions(Mix(0.4)), (0,), tmp_path)
     recording.make(silent)
     content = json.loads(recording.file.read_text())
     del content["episodes"]["0"]["vehicles"][1:], content["episodes"]["0"]["vehicles"][0]["x_m"][1:]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from tests.study.scenes import given, trained
-from tint_sumo.config import ALL_MIXES
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.statistics import Rate, rate_interval
 from tint_sumo.methods.evaluation import Case, Evaluation
 from tint_sumo.study.budgets import Conditions
@@ -17,10 +17,10 @@ NOISY, SLOW, FAST = Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, tau_s=1.5)
 HALF = Conditions(ALL_MIXES, percent=50)
 
 SOME_RESULTS = [
-    trained("oracle", 1, {Conditions(0.4): (8, 1, 1), WORLD: (5, 0, 0)}),
-    given("ttc", {Conditions(0.25): (5, 4, 1), Conditions(0.4): (6, 4, 0)}),
-    trained("oracle", 0, {Conditions(0.4): (9, 1, 0), WORLD: (4, 0, 1)}),
-    given("always_go", {Conditions(0.4): (0, 0, 10)}),
+    trained("oracle", 1, {Conditions(Mix(0.4)): (8, 1, 1), WORLD: (5, 0, 0)}),
+    given("ttc", {Conditions(Mix(0.25)): (5, 4, 1), Conditions(Mix(0.4)): (6, 4, 0)}),
+    trained("oracle", 0, {Conditions(Mix(0.4)): (9, 1, 0), WORLD: (4, 0, 1)}),
+    given("always_go", {Conditions(Mix(0.4)): (0, 0, 10)}),
 ]
 
 
@@ -31,7 +31,7 @@ def find(rows: Sequence[Row], method: str, conditions: Conditions) -> Row:
 
 @pytest.fixture
 def oracle() -> Row:
-    return find(tabulate(SOME_RESULTS), "oracle", Conditions(0.4))
+    return find(tabulate(SOME_RESULTS), "oracle", Conditions(Mix(0.4)))
 
 
 def test_the_seeds_of_a_method_make_one_row(oracle: Row) -> None:
@@ -45,31 +45,31 @@ def test_the_seeds_of_a_method_make_one_row(oracle: Row) -> None:
 
 def test_the_time_is_the_mean_of_all_successes(oracle: Row) -> None:
     assert oracle.navigation_time_s == pytest.approx((sum(range(10, 19)) + sum(range(10, 18))) / 17)
-    assert find(tabulate(SOME_RESULTS), "always_go", Conditions(0.4)).navigation_time_s is None
+    assert find(tabulate(SOME_RESULTS), "always_go", Conditions(Mix(0.4))).navigation_time_s is None
 
 
 def test_rows_go_by_conditions_and_then_in_the_order_of_the_registry() -> None:
     assert [(row.method, row.conditions) for row in tabulate(SOME_RESULTS)] == [
-        ("ttc", Conditions(0.25)),
-        ("always_go", Conditions(0.4)),
-        ("ttc", Conditions(0.4)),
-        ("oracle", Conditions(0.4)),
+        ("ttc", Conditions(Mix(0.25))),
+        ("always_go", Conditions(Mix(0.4))),
+        ("ttc", Conditions(Mix(0.4))),
+        ("oracle", Conditions(Mix(0.4))),
         ("oracle", WORLD),
     ]
 
 
 def test_the_training_s_world_comes_first_and_shorter_trainings_last() -> None:
-    worlds = (HALF, SLOW, NOISY, FAST, WORLD, Conditions(0.4))
+    worlds = (HALF, SLOW, NOISY, FAST, WORLD, Conditions(Mix(0.4)))
     rows = tabulate([trained("oracle", 0, dict.fromkeys(worlds, (1, 0, 0)))])
-    assert [row.conditions for row in rows] == [Conditions(0.4), WORLD, FAST, SLOW, NOISY, HALF]
+    assert [row.conditions for row in rows] == [Conditions(Mix(0.4)), WORLD, FAST, SLOW, NOISY, HALF]
 
 
 def test_trainings_for_other_mixes_and_shipped_policies_are_rows_of_their_own() -> None:
-    fared = {Conditions(0.4): (1, 0, 1)}
-    rows = tabulate([trained("vae", 0, fared), given("vae", fared), trained("vae", 0, fared, mix=0.4)])
-    assert [(row.origin, row.mix) for row in rows] == [("given", None), ("trained", ALL_MIXES), ("trained", 0.4)]
+    fared = {Conditions(Mix(0.4)): (1, 0, 1)}
+    rows = tabulate([trained("vae", 0, fared), given("vae", fared), trained("vae", 0, fared, mix=Mix(0.4))])
+    assert [(row.origin, row.mix) for row in rows] == [("given", None), ("trained", ALL_MIXES), ("trained", Mix(0.4))]
     assert [row.title for row in rows] == ["paper's method (shipped)", "paper's method", "paper's method"]
-    assert find(tabulate(SOME_RESULTS), "ttc", Conditions(0.25)).title == "time to collision"
+    assert find(tabulate(SOME_RESULTS), "ttc", Conditions(Mix(0.25))).title == "time to collision"
 
 
 def test_a_method_that_is_no_longer_known_keeps_its_name_and_comes_last() -> None:
@@ -80,27 +80,29 @@ def test_a_method_that_is_no_longer_known_keeps_its_name_and_comes_last() -> Non
 def test_the_spread_is_the_standard_deviation_between_seeds(oracle: Row) -> None:
     assert oracle.spread("success") == pytest.approx(0.1 / 2**0.5)
     assert oracle.spread("timeout") == 0.0
-    assert find(tabulate(SOME_RESULTS), "ttc", Conditions(0.4)).spread("success") is None
+    assert find(tabulate(SOME_RESULTS), "ttc", Conditions(Mix(0.4))).spread("success") is None
 
 
 def test_intervals_are_over_seeds_and_cases_or_over_the_cases_of_the_only_seed(oracle: Row) -> None:
     assert oracle.intervals["success"] == rate_interval(oracle.hits("success"))
-    assert find(tabulate(SOME_RESULTS), "ttc", Conditions(0.4)).intervals["success"] == Rate(6, 10).interval
+    assert find(tabulate(SOME_RESULTS), "ttc", Conditions(Mix(0.4))).intervals["success"] == Rate(6, 10).interval
 
 
 def test_the_paper_s_numbers_stand_beside_the_paper_s_own_conditions_alone() -> None:
-    fared = dict.fromkeys((Conditions(0.4), Conditions(0.4, 0.1), Conditions(0.4, percent=50), WORLD), (1, 0, 0))
+    fared = dict.fromkeys(
+        (Conditions(Mix(0.4)), Conditions(Mix(0.4), 0.1), Conditions(Mix(0.4), percent=50), WORLD), (1, 0, 0)
+    )
     published = {
         (row.method, row.conditions): row.published for row in tabulate([trained("oracle", 0, fared), *SOME_RESULTS])
     }
-    assert published.pop(("oracle", Conditions(0.4))) == {"success": 90, "timeout": 4, "collision": 5}
+    assert published.pop(("oracle", Conditions(Mix(0.4)))) == {"success": 90, "timeout": 4, "collision": 5}
     assert not any(published.values())
 
 
 def test_the_main_table_has_the_mixes_and_another_one_the_worlds() -> None:
-    fared = dict.fromkeys((Conditions(0.4), Conditions(0.4, 0.1), WORLD, NOISY, HALF), (1, 0, 0))
+    fared = dict.fromkeys((Conditions(Mix(0.4)), Conditions(Mix(0.4), 0.1), WORLD, NOISY, HALF), (1, 0, 0))
     rows = tabulate([trained("oracle", 0, fared)])
-    assert [row.conditions for row in at_mixes(rows)] == [Conditions(0.4)]
+    assert [row.conditions for row in at_mixes(rows)] == [Conditions(Mix(0.4))]
     assert [row.conditions for row in over_all_mixes(rows)] == [WORLD, NOISY, HALF]
 
 
@@ -115,7 +117,7 @@ def test_rows_tell_the_headway_of_the_scene_s_drivers_where_no_other_one_is_test
 
 
 def test_an_only_mix_of_whole_numbers_is_in_the_main_table() -> None:
-    rows = tabulate([given("ttc", {Conditions(1): (1, 0, 0)})])
+    rows = tabulate([given("ttc", {Conditions(Mix(1)): (1, 0, 0)})])
     assert at_mixes(rows) == rows
 
 

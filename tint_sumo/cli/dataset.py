@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar, Literal
 from tyro.conf import Positional, Suppress, arg, subcommand
 
 from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, flag_of, wrote
-from tint_sumo.cli.values import SCENES, FolderOrUrl, PopulationValue, SceneValue, ShareFlag, share_of
-from tint_sumo.config import TrafficSeed, WindowCount
+from tint_sumo.cli.values import SCENES, FolderOrUrl, MixFlag, PopulationValue, SceneValue
+from tint_sumo.config import Mix, TrafficSeed, WindowCount
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import PICTURE_SUFFIXES, require_output_file
 from tint_sumo.core.ranges import Processes
@@ -24,7 +24,7 @@ class Record(SpreadCommand):
     """Folder for the dataset, or a URL such as s3://bucket/folder."""
     windows: WindowCount = 30_000
     """At least so many windows of up to 20 steps of 0.1 s."""
-    p_conservative: ShareFlag = (0.5,)
+    p_conservative: MixFlag = (0.5,)
     """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
     population: PopulationValue = None
     """traits: conservative and aggressive drivers; continuous: desired speeds and gaps without classes; the scene's
@@ -53,7 +53,7 @@ class Record(SpreadCommand):
             manifest = record(
                 self.out,
                 self.windows,
-                p_conservative=share_of(self.p_conservative),
+                p_conservative=Mix.parse(self.p_conservative),
                 population=self.population,
                 seed=self.seed,
                 scene=self.scene,

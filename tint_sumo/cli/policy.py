@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import arg, subcommand
 
 from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, use_one_thread, wrote
-from tint_sumo.cli.values import PPO_BUDGET, SCENES, Cases, FolderOrUrl, PpoBudgetValue, SceneValue, ShareFlag, share_of
-from tint_sumo.config import Decisions, NoiseM, Seed, TauS
+from tint_sumo.cli.values import PPO_BUDGET, SCENES, Cases, FolderOrUrl, MixFlag, PpoBudgetValue, SceneValue
+from tint_sumo.config import Decisions, Mix, NoiseM, Seed, TauS
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.ranges import Processes, Range
 from tint_sumo.core.stores import name_in, working_folder
-from tint_sumo.core.structures import Many
+from tint_sumo.core.structures import Many, plain
 
 if TYPE_CHECKING:
     from tint_sumo.methods.loading import Contender
@@ -28,7 +28,7 @@ class TrainPolicy(Command):
     """Learned method: no_labels, morton, vae, no_attention, cross_window, streaming, streaming_critic, ma or oracle."""
     out: Path
     """Folder for the policy, its card, the training's curve and the TensorBoard log."""
-    p_conservative: ShareFlag = (0.1, 0.9)
+    p_conservative: MixFlag = (0.1, 0.9)
     """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
     steps: Decisions | None = None
     """Decisions of the policy; those of the budget if not given."""
@@ -56,11 +56,11 @@ class TrainPolicy(Command):
         has_mix = is_given or self.scene == ALL_SCENES or find_scene(self.scene).sumocfg is None
         settings = PPO_BUDGET.full(self.budget)
         steps = settings.total_steps if self.steps is None else self.steps
-        share = share_of(self.p_conservative) if has_mix else None
+        mix = Mix.parse(self.p_conservative) if has_mix else None
         with one_job(f"train {self.method}") as report:
             policy = train_policy(
                 self.method,
-                share,
+                mix,
                 steps,
                 self.seed,
                 self.out,
@@ -83,7 +83,7 @@ class EvaluatePolicy(SpreadCommand):
     model: str
     """A shipped policy by its method's name (streaming, oracle, ...), always_go, ttc, the folder of a training run, a
     .safetensors file, or with --allow-pickle a .zip file."""
-    p_conservative: ShareFlag | None = None
+    p_conservative: MixFlag | None = None
     """Probability that a driver is conservative, 0 to 1, or two numbers between which each case draws its own; those
     of the policy's training if not given."""
     scene: SceneValue = None
@@ -130,7 +130,7 @@ class EvaluatePolicy(SpreadCommand):
         ]
         time_s = evaluation.navigation_time_s
         lines.append("no success" if time_s is None else f"navigation time {time_s:.1f} s")
-        place = {"model": self.model, "scene": contender.scene_name, **world}
+        place = {"model": self.model, "scene": contender.scene_name, **plain(world)}
         return Outcome("\n".join(lines), {**place, "seed": self.seed, **evaluation.summary()})
 
 
@@ -150,7 +150,7 @@ class SweepPolicy(SpreadCommand):
     """Learned methods: no_labels, morton, vae, no_attention, cross_window, streaming, streaming_critic, ma, oracle."""
     seeds: Many[Seed] = (0,)
     """Seeds of the trainings, 0 to 1000."""
-    p_conservative: ShareFlag = (0.1, 0.9)
+    p_conservative: MixFlag = (0.1, 0.9)
     """Probability in training that a driver is conservative, 0 to 1; two numbers: each episode draws its own between
     them. Tests are at those of 0.25, 0.4 and 0.6 that this includes."""
     budget: PpoBudgetValue = "full"
@@ -171,7 +171,7 @@ class SweepPolicy(SpreadCommand):
             read_varied(self.set),
             methods=self.methods,
             seeds=self.seeds,
-            p_conservative=share_of(self.p_conservative),
+            p_conservative=Mix.parse(self.p_conservative),
             scene=self.scene,
             episodes=self.episodes,
         )
@@ -195,11 +195,11 @@ class Policy:
 
 
 def world_of(
-    contender: "Contender", p_conservative: ShareFlag | None, noise_m: float, tau_s: float | None
+    contender: "Contender", p_conservative: MixFlag | None, noise_m: float, tau_s: float | None
 ) -> dict[str, Any]:
     """Where a policy is evaluated: what is not given is that of its training."""
     return {
-        "p_conservative": contender.p_conservative if p_conservative is None else share_of(p_conservative),
+        "p_conservative": contender.p_conservative if p_conservative is None else Mix.parse(p_conservative),
         "position_noise_m": noise_m,
         "tau_s": contender.tau_s if tau_s is None else tau_s,
     }

@@ -6,9 +6,10 @@ from typing import Annotated
 
 from tint_sumo.cli.command import Command, Outcome, use_one_thread
 from tint_sumo.cli.policy import world_of
-from tint_sumo.cli.values import SceneValue, ShareFlag
+from tint_sumo.cli.values import MixFlag, SceneValue
 from tint_sumo.config import NoiseM, Seed, TauS
 from tint_sumo.core.ranges import Range
+from tint_sumo.core.structures import plain
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +21,7 @@ class Render(Command):
     .safetensors file, or with --allow-pickle a .zip file."""
     out: Path
     """The film, .mp4 (needs tint_sumo[video]) or .gif, or a strip of eight moments, .png."""
-    p_conservative: ShareFlag | None = None
+    p_conservative: MixFlag | None = None
     """Probability that a driver is conservative, 0 to 1, or two numbers between which the case draws its own; those
     of the policy's training if not given."""
     case: Annotated[int, Range(0, 999_999)] = 0
@@ -48,5 +49,11 @@ class Render(Command):
         with one_job(f"render {self.out}") as report:
             film = render_case(contender, self.case, self.out, seed=self.seed, report=report, **world)
         text = f"{film.outcome} after {film.time_s:.1f} s, {film.frames} frames: {self.out}"
-        content = {"model": self.model, "scene": contender.scene_name, **world, "case": self.case, "seed": self.seed}
+        content = {
+            "model": self.model,
+            "scene": contender.scene_name,
+            **plain(world),
+            "case": self.case,
+            "seed": self.seed,
+        }
         return Outcome(text, {**content, "out": str(self.out), **asdict(film)})

@@ -1,22 +1,17 @@
 """Types of flags. A scene, a population or a budget is a name, or is defined in a configuration file."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
 from tint_sumo import ENV_IDS
 from tint_sumo.cli.configuration import FromFile, name_flag, one_of
 from tint_sumo.config import Fraction
-from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import Many, Where
 
-if TYPE_CHECKING:
-    from tint_sumo.config import Share
-
-
 Cases = Annotated[int, Range(1, 1_000_000)]
-ShareFlag = Many[Fraction]  # one probability, or the two ends of a range
+MixFlag = Many[Fraction]  # one probability, or the two ends of a range
 SCENES = ", ".join(ENV_IDS)
 
 
@@ -67,10 +62,3 @@ PpoBudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), PPO_BUDGET]
 TraitBudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), TRAIT_BUDGET]
 TraitStudyValue = Annotated[Any, name_flag("full"), TRAIT_STUDY]
 SceneStudyValue = Annotated[Any, name_flag("full"), SCENE_STUDY]
-
-
-def share_of(numbers: ShareFlag) -> "Share":
-    """Return the probability, or the range, that the numbers of --p-conservative mean."""
-    if len(numbers) not in (1, 2):
-        raise InputError(f"p_conservative is one probability or two, from low to high, not {len(numbers)} numbers")
-    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])

@@ -1,7 +1,7 @@
 """Other settings of PPO: every combination of some values is trained and tested, and one table compares them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import product
 from operator import attrgetter
@@ -13,18 +13,15 @@ import pandas as pd
 from tint_sumo.config import (
     ALL_MIXES,
     P_CONSERVATIVE,
+    Mix,
     PolicySettings,
     PpoSettings,
-    Share,
-    ends,
-    require_distinct,
-    require_share,
-    share_words,
 )
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import claim_folder, write_text
 from tint_sumo.core.progress import Report
-from tint_sumo.core.structures import overlay, require_fields
+from tint_sumo.core.ranges import require_distinct
+from tint_sumo.core.structures import overlay, plain, require_fields
 from tint_sumo.core.yaml_files import read_list
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.jobs import Workers, executor_of
@@ -54,7 +51,7 @@ class Sweep:
     varied: Mapping[str, Sequence[Any]]  # the values by the name of the setting, one of SETTINGS
     methods: tuple[str, ...] = ("oracle",)
     seeds: tuple[int, ...] = (0,)
-    p_conservative: Share = ALL_MIXES  # in training
+    p_conservative: Mix = ALL_MIXES  # in training
     scene: str | Scene = T_INTERSECTION
     episodes: int = 500  # cases at each P(conservative)
 
@@ -63,10 +60,9 @@ class Sweep:
         for seed in self.seeds:
             require_seed(seed)
         require_cases(self.episodes, TUNING_CASES)
-        require_share(self.p_conservative)
         if not self.tested:
             tested = ", ".join(f"{p:g}" for p in P_CONSERVATIVE)
-            trained = share_words(self.p_conservative)
+            trained = self.p_conservative.text
             raise InputError(f"p_conservative must include one of {tested}, where policies are tested, not {trained}")
         self._require_values()
         _require_traits([find_learned(name) for name in self.methods], require_scene("a sweep", self.scene))
@@ -105,8 +101,7 @@ class Sweep:
     @property
     def tested(self) -> tuple[float, ...]:
         """Where policies are tested: at each P(conservative) that they are trained for."""
-        low, high = ends(self.p_conservative)
-        return tuple(p for p in P_CONSERVATIVE if low <= p <= high)
+        return tuple(p for p in P_CONSERVATIVE if self.p_conservative.contains(Mix(p)))
 
 
 def read_varied(words: Sequence[str]) -> dict[str, list[Any]]:
@@ -147,7 +142,7 @@ def run_sweep(sweep: Sweep, out: Path, *, workers: Workers = 2, progress: bool =
         JobError: jobs were given up; all others are done.
     """
     executor = executor_of(workers)
-    with claim_folder(out, {"kind": "sweep", **asdict(sweep), **described(sweep.scene)}):
+    with claim_folder(out, {"kind": "sweep", **plain(sweep), **described(sweep.scene)}):
         executor.run(plan(sweep, out), progress)
         table = _read_table(_tests(sweep, out))
         write_text(out / "sweep.csv", table.to_csv(index=False))
@@ -214,7 +209,7 @@ def _trainings(sweep: Sweep, out: Path) -> list[VariantJob]:
 
 
 def _tests(sweep: Sweep, out: Path) -> list[VariantJob]:
-    trials = (Trials(tuple(Conditions(p) for p in sweep.tested), sweep.episodes),)
+    trials = (Trials(tuple(Conditions(Mix(p)) for p in sweep.tested), sweep.episodes),)
     return [
         VariantJob(
             variant, EvaluateJob(method, sweep.p_conservative, seed, trials, out, sweep.scene, TUNING_CASES), out
@@ -236,7 +231,7 @@ def _read_table(tests: Sequence[VariantJob]) -> pd.DataFrame:
                     "variant": job.variant,
                     "method": result.method,
                     "seed": result.seed,
-                    "p_conservative": one.conditions.p_conservative,
+                    "p_conservative": one.conditions.p_conservative.low,
                     **{outcome: one.evaluation.rate(outcome).value for outcome in OUTCOMES},
                     "navigation_time_s": one.evaluation.navigation_time_s,
                 }

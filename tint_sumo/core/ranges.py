@@ -77,6 +77,22 @@ def require_ranges(owner: Any) -> None:
             raise InputError(f"{name} {error}") from None
 
 
+def require_distinct(owner: object, *names: str) -> None:
+    """Raise InputError unless these fields of a dataclass have one or more values, each of them once."""
+    for name in names:
+        values = getattr(owner, name)
+        if len(set(values)) < max(1, len(values)):
+            raise InputError(f"{name} must be one or more, each of them once, not {shown(list(values))}")
+
+
+def set_floats(owner: object, *names: str) -> None:
+    """Make floats of the numbers in these fields of a frozen dataclass, so that 1 and 1.0 are one value; None stays."""
+    for name in names:
+        value = getattr(owner, name)
+        if value is not None:
+            object.__setattr__(owner, name, float(value))
+
+
 @cache
 def _hints(kind: Any) -> dict[str, Any]:
     return {name: hint for name, hint in get_type_hints(kind, include_extras=True).items() if _has_range(hint)}

@@ -1,13 +1,26 @@
 """Dataclasses from what a file says, and back. Pydantic checks the types; its errors become one clear line each."""
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    Self,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from tint_sumo.core.errors import InputError, shown
 from tint_sumo.core.ranges import Range
@@ -67,6 +80,29 @@ class ReadBy:
         from pydantic_core import core_schema
 
         return core_schema.no_info_plain_validator_function(self.read)
+
+
+class FileForm(ABC):
+    """Base of types that files write in another form than a mapping of their fields."""
+
+    form: ClassVar[str]  # the form in words, which messages put behind "must be"
+
+    @classmethod
+    @abstractmethod
+    def parse(cls, value: Any) -> Self:
+        """Return the value that a file gives in this form.
+
+        Raises:
+            InputError: it is not of this form.
+        """
+
+    @abstractmethod
+    def plain(self) -> Any:
+        """Return the value as YAML and JSON can hold it."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
+        return ReadBy(cls.parse).__get_pydantic_core_schema__(source, handler)
 
 
 class OneOrMany:
@@ -201,7 +237,9 @@ def require_fields(value: Mapping[Any, Any], known: Mapping[str, Any], where: Wh
 
 
 def plain(value: Any) -> Any:
-    """A value as YAML and JSON can hold it; ``build`` makes the same value of it again."""
+    """Return a value as YAML and JSON can hold it; ``build`` makes the same value of it again."""
+    if isinstance(value, FileForm):
+        return value.plain()
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in fields(value) if field.init}
     if isinstance(value, Mapping):
@@ -305,8 +343,8 @@ def _words(kind: Any) -> str:
     if get_origin(kind) is Annotated:
         limits = [str(one) for one in arguments[1:] if isinstance(one, Range)]
         return " ".join([_words(arguments[0]), *limits])
-    if is_dataclass(kind):
-        return f"a mapping of {', '.join(_names(kind))}"
+    if isinstance(kind, type) and is_dataclass(kind):
+        return kind.form if issubclass(kind, FileForm) else f"a mapping of {', '.join(_names(kind))}"
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(str, arguments))}"
     if get_origin(kind) is tuple:

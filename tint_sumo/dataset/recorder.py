@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import Population, Share, find_population, population_name
+from tint_sumo.config import AnyMix, Mix, Population, find_population, population_name
 from tint_sumo.core.structures import plain
 from tint_sumo.dataset.fcd import write_fcd
 from tint_sumo.dataset.schema import (
@@ -42,10 +42,10 @@ EPISODES_PER_SHARD = 16
 
 @dataclass(frozen=True)
 class Recording:
-    """What to record: at least ``windows`` windows of traffic with this share of conservative drivers."""
+    """What to record: at least ``windows`` windows of traffic with this mix of drivers."""
 
     windows: int
-    p_conservative: Share = 0.5
+    p_conservative: Mix
     population: Population | None = None  # the scene's if not given
     seed: int = 0
     scene: str | Scene = T_INTERSECTION
@@ -66,7 +66,7 @@ class Recording:
             "schema_version": SCHEMA_VERSION,
             **described(played),
             "windows": self.windows,
-            "p_conservative": self.p_conservative,
+            "p_conservative": self.p_conservative.plain(),
             "population": population_name(played.population) or plain(played.population),
             "seed": self.seed,
         }
@@ -76,7 +76,7 @@ def record(
     out: str | Path,
     windows: int,
     *,
-    p_conservative: Share = 0.5,
+    p_conservative: AnyMix = 0.5,
     population: str | Population | None = None,
     seed: int = 0,
     scene: str | Scene = T_INTERSECTION,
@@ -94,7 +94,7 @@ def record(
         InputError: bad values, or ``out`` holds another run.
     """
     drivers = find_population(population) if isinstance(population, str) else population
-    recording = Recording(windows, p_conservative, drivers, seed, scene)
+    recording = Recording(windows, Mix.parse(p_conservative), drivers, seed, scene)
     try:
         return record_dataset(
             out,

@@ -17,7 +17,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tint_sumo.config import NO_LEADER_GAP_M, WINDOW_STEPS, DriverProfile, Share, TrafficSeed, read_population
+from tint_sumo.config import NO_LEADER_GAP_M, WINDOW_STEPS, DriverProfile, Mix, TrafficSeed, read_population
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_json
 from tint_sumo.core.ranges import Range
@@ -78,7 +78,7 @@ class Manifest:
     scene_digest: str
     scene_settings: dict[str, Any] | None = None  # of a scene that differs from its base
     windows: _Count
-    p_conservative: Share | None  # None: the traffic of a SUMO configuration
+    p_conservative: Mix | None  # None: the traffic of a SUMO configuration
     population: str | dict[str, Any] | tuple[str, ...]  # name, profiles, or the vTypes of a SUMO configuration
     seed: TrafficSeed
     window_steps: int = WINDOW_STEPS

@@ -17,8 +17,8 @@ from tint_sumo.config import (
     SPEED_SCALE_MPS,
     Backend,
     Decisions,
+    Mix,
     NoiseM,
-    Share,
     TauS,
     TimeS,
 )
@@ -58,7 +58,7 @@ class TaskSettings:
     """
 
     scene: str | Scene | SumocfgScene = T_INTERSECTION
-    p_conservative: Share | None = None
+    p_conservative: Mix | None = None
     reward: str = "paper"
     time_limit_s: TimeS | None = None
     position_noise_m: NoiseM = 0.0
@@ -69,6 +69,8 @@ class TaskSettings:
     backend: Backend = "auto"
 
     def __post_init__(self) -> None:
+        if self.p_conservative is not None:
+            object.__setattr__(self, "p_conservative", Mix.parse(self.p_conservative))
         if self.reward not in REWARD_PRESETS:
             raise InputError(f"unknown reward preset {self.reward!r}; choose one of {', '.join(REWARD_PRESETS)}")
         require_ranges(self)

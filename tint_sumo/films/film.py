@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageColor
 
-from tint_sumo.config import Share, share_words
+from tint_sumo.config import AnyMix, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import require_output_file, whole_file
 from tint_sumo.core.progress import Progress, Report, silent
@@ -42,7 +42,7 @@ def render_case(
     out: Path,
     *,
     seed: int = 0,
-    p_conservative: Share | None = None,
+    p_conservative: AnyMix | None = None,
     report: Report = silent,
     **task: Any,
 ) -> Film:
@@ -66,11 +66,11 @@ def render_case(
     require_seed(seed)
     if not 0 <= case < CASES_PER_SEED:
         raise InputError(f"case must lie in 0 to {CASES_PER_SEED - 1}, not {case}")
-    share = contender.p_conservative if p_conservative is None else p_conservative
+    mix = contender.p_conservative if p_conservative is None else Mix.parse(p_conservative)
     played = require_film_scene(contender)
-    moments = list(drive_case(contender, case, seed, p_conservative=share, **task))
+    moments = list(drive_case(contender, case, seed, p_conservative=mix, **task))
     shown = _spread(moments) if out.suffix.lower() == ".png" else moments
-    parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(share))
+    parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(mix))
     has_attention = moments[0].attention is not None
     colour = ImageColor.getrgb(look_of(contender.method).colour)
     artist = Artist(layout(played), (" " * 5).join(parts), colour, fit_reader(contender), has_attention)
@@ -100,9 +100,9 @@ def _spread(moments: Sequence[Moment]) -> list[Moment]:
     return [moments[index] for index in np.linspace(0, len(moments) - 1, across * down).round().astype(int).tolist()]
 
 
-def _words(share: Share | None) -> str:
-    assert share is not None  # it is None in a SUMO configuration alone
-    return f"P(conservative) {share_words(share)}"
+def _words(mix: Mix | None) -> str:
+    assert mix is not None  # it is None in a SUMO configuration alone
+    return f"P(conservative) {mix.text}"
 
 
 def _frames(artist: Artist, moments: Sequence[Moment], report: Report) -> Iterator[Image.Image]:

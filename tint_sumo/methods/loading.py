@@ -10,7 +10,7 @@ from typing import Any
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits
-from tint_sumo.config import LATENT_SIZE, Share, ends, is_share
+from tint_sumo.config import LATENT_SIZE, Mix, Traffic
 from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import InputError, refuse_old_name
 from tint_sumo.core.files import shipped
@@ -23,8 +23,6 @@ from tint_sumo.policy.wrappers import policy_venv
 from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, find_scene, read_described
 from tint_sumo.traits import TraitModel
 
-DEFAULT_P_CONSERVATIVE = 0.4
-
 
 @dataclass(frozen=True)
 class Contender:
@@ -33,7 +31,7 @@ class Contender:
     name: str
     policy: Policy
     source: Callable[[], TraitSource] | None = None  # source of the traits in its observations; None: it has no traits
-    p_conservative: Share | None = DEFAULT_P_CONSERVATIVE  # what it was trained for; None in a SUMO configuration
+    p_conservative: Mix | None = Traffic.p_conservative  # what it was trained for; None in a SUMO configuration
     action_repeat: int = 1  # simulation steps per decision
     scene: AnyScene = T_INTERSECTION  # what it was trained in
     method: str = ""  # name of the method in the registry
@@ -108,7 +106,7 @@ def _in_scene(contender: Contender, scene: AnyScene) -> Contender:
     ):
         if wanted != there:
             raise InputError(f"policy {contender.name} needs {what} of {wanted}, and scene {found.name} has {there}")
-    trained_for = DEFAULT_P_CONSERVATIVE if contender.p_conservative is None else contender.p_conservative
+    trained_for = Traffic.p_conservative if contender.p_conservative is None else contender.p_conservative
     return replace(contender, scene=scene, p_conservative=None if found.sumocfg else trained_for)
 
 
@@ -141,7 +139,7 @@ def _contender(stem: Path, policy: Any) -> Contender:
         stem.name,
         policy,
         lambda: learned.make_source(encoder),
-        None if card["p_conservative"] is None else ends(card["p_conservative"]),
+        None if card["p_conservative"] is None else Mix.parse(card["p_conservative"]),
         int(card["settings"]["action_repeat"]),
         read_described(card),
         learned.name,
@@ -189,13 +187,21 @@ def _checked_card(stem: Path) -> dict[str, Any]:
     refuse_old_name(card.get("method"))
     method = METHODS.get(str(card.get("method")))
     settings = card.get("settings")
-    share = card.get("p_conservative")
-    fits = isinstance(method, Learned) and (is_share(share) or (share is None and "scene_settings" in card))
+    mix = card.get("p_conservative")
+    fits = isinstance(method, Learned) and (_is_mix(mix) or (mix is None and "scene_settings" in card))
     fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
     fits &= "scene_settings" in card or str(card.get("scene")) in (*SCENES, ALL_SCENES)
     if not fits or (isinstance(method, Learned) and method.encoder and not _is_file_name(card.get("traits"))):
         raise InputError(f"{card_file(stem)} is not the card of a policy; restore the file or train the policy again")
     return card
+
+
+def _is_mix(value: object) -> bool:
+    try:
+        Mix.parse(value)
+    except InputError:
+        return False
+    return True
 
 
 def _is_file_name(value: object) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tint_sumo.config import share_words
+from tint_sumo.config import Mix
 from tint_sumo.core.errors import find_named
 from tint_sumo.core.files import read_json, shipped
 from tint_sumo.core.percentages import percent
@@ -76,14 +76,15 @@ def _described(kind: str, weights: Path) -> ShippedModel:
     else:
         data, settings = card["data"], card["settings"]
         scene = data["scene"]
-        training = f"{card['windows']:,} windows, P {share_words(data['p_conservative'])}, {settings['epochs']} epochs"
+        mix = Mix.parse(data["p_conservative"]).text
+        training = f"{card['windows']:,} windows, P {mix}, {settings['epochs']} epochs"
         result = f"{percent(card['accuracy'])}% of windows (linear SVC, noise {settings['noise_m']:g} m)"
     return ShippedModel(weights.stem, kind, card["method"], scene, training, result, card)
 
 
 def _policy_training(card: Mapping[str, Any]) -> str:
     traits = f", traits of {card['traits']}" if card["traits"] else ""
-    return f"{card['steps']:,} decisions, P {share_words(card['p_conservative'])}, seed {card['seed']}{traits}"
+    return f"{card['steps']:,} decisions, P {Mix.parse(card['p_conservative']).text}, seed {card['seed']}{traits}"
 
 
 def _policy_result(results: Mapping[str, Any]) -> str:

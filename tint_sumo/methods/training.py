@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits as trait_models
-from tint_sumo.config import LATENT_SIZE, SNAPSHOTS_PERCENT, PpoSettings, Share, ends
+from tint_sumo.config import LATENT_SIZE, SNAPSHOTS_PERCENT, Mix, PpoSettings
 from tint_sumo.core.checkpoints import remove_checkpoint, write_checkpoint
 from tint_sumo.core.determinism import preserved_random_state, single_threaded
 from tint_sumo.core.errors import DivergedError, InputError, NotFiniteError
@@ -54,7 +54,7 @@ def snapshot_stem(out: Path, percent: int) -> Path:
 
 def train_policy(
     method: str,
-    p_conservative: Share | None,
+    p_conservative: Mix | None,
     steps: int,
     seed: int,
     out: Path,
@@ -78,8 +78,7 @@ def train_policy(
 
     Args:
         method: name of a learned method.
-        p_conservative: share of conservative drivers it trains among; a range: each episode draws its own. None in a
-            SUMO configuration, whose demand tells who drives.
+        p_conservative: mix of the drivers it trains among; None in a SUMO configuration, whose demand says who drives.
         steps: decisions of the policy, at least; training ends with a whole rollout.
         seed: of weights, actions and environments, 0 to 1000.
         out: a new folder, or the one of this very run.
@@ -114,7 +113,7 @@ def train_policy(
     identity = {
         "kind": "policy",
         "method": method,
-        "p_conservative": None if p_conservative is None else list(ends(p_conservative)),
+        "p_conservative": None if p_conservative is None else [p_conservative.low, p_conservative.high],
         "steps": steps,
         "seed": seed,
         **place,
@@ -168,7 +167,7 @@ def share_training(source: Path, method: str, out: Path, traits: str | Path | No
             save_policy(load_policy_network(stem), snapshot_stem(out, percent), {**read_policy_card(stem), **own})
 
 
-def _require_drivers(learned: Learned, p_conservative: Share | None, scene: AnyScene) -> None:
+def _require_drivers(learned: Learned, p_conservative: Mix | None, scene: AnyScene) -> None:
     """Raise InputError unless a method can be trained among a scene's drivers, in such a mix."""
     played = T_INTERSECTION if scene == ALL_SCENES else scene
     found = find_scene(played)
@@ -191,7 +190,7 @@ def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | N
 def training_venv(
     learned: Learned,
     encoder: TraitModel | None,
-    p_conservative: Share | None,
+    p_conservative: Mix | None,
     settings: PpoSettings,
     scene: AnyScene = T_INTERSECTION,
 ) -> VecEnv:

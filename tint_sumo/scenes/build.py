@@ -33,7 +33,7 @@ def scene_files(scene: Scene, replicas: int, spacing_m: float = REPLICA_SPACING_
         "tint.edg.xml": sources.edges,
         "tint.con.xml": sources.connections,
         NET_FILE: build_network(sources),
-        DRIVERS_FILE: vtypes_xml(scene.population, scene.traffic.mean_p_conservative, scene.vehicle),
+        DRIVERS_FILE: vtypes_xml(scene.population, scene.traffic.p_conservative.mean, scene.vehicle),
         ROUTES_FILE: _routes_xml(scene, replicas),
         "saturated.rou.xml": _flows_xml(scene, replicas, f"exp({_SATURATED_RATE_PER_S:g})"),
         "poisson.rou.xml": _flows_xml(scene, replicas, f"exp({DEMO_POISSON_RATE_PER_S:g})"),

@@ -12,8 +12,8 @@ from typing import ClassVar
 from tint_sumo.config import (
     Claim,
     EgoController,
+    Mix,
     Population,
-    Share,
     Slots,
     StepS,
     TimeS,
@@ -121,7 +121,7 @@ class Scene:
         """Speed that no vehicle exceeds."""
         return self.network.speed_limit_mps
 
-    def with_drivers(self, p_conservative: Share | None, tau_s: float | None) -> "Scene":
+    def with_drivers(self, p_conservative: Mix | None, tau_s: float | None) -> "Scene":
         """Return the scene with another mix and another time headway of its drivers, where they are given."""
         population, traffic = self.population, self.traffic
         if tau_s is not None:

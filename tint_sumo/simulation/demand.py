@@ -102,7 +102,8 @@ class Demand:
 
     def begin(self, replica: int, seed: np.random.SeedSequence) -> list[PlacedVehicle]:
         """Start an episode; return the vehicles that are on the roads already."""
-        p_conservative = np.random.default_rng(seed).uniform(*self._pool.scene.traffic.p_conservative_range)
+        mix = self._pool.scene.traffic.p_conservative
+        p_conservative = np.random.default_rng(seed).uniform(mix.low, mix.high)
         streams = tuple(
             DriverStream(np.random.default_rng(child), self._pool, p_conservative)
             for child in seed.spawn(len(self._layout.routes))

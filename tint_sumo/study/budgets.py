@@ -10,18 +10,15 @@ from tint_sumo.config import (
     SNAPSHOTS_PERCENT,
     TRAIT_BUDGETS,
     Fraction,
+    Mix,
     NoiseM,
     PpoSettings,
     Seed,
-    Share,
     TauS,
     TraitSettings,
-    require_distinct,
-    require_share,
-    set_floats,
 )
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.ranges import Range, require_ranges
+from tint_sumo.core.ranges import Range, require_distinct, require_ranges, set_floats
 from tint_sumo.core.structures import Many
 
 
@@ -29,15 +26,14 @@ from tint_sumo.core.structures import Many
 class Conditions:
     """The world in which a policy is tested, and after which part of its training."""
 
-    p_conservative: Share
+    p_conservative: Mix
     position_noise_m: NoiseM = 0.0
     tau_s: TauS | None = None  # time headway of the other drivers; None: the scene's
     percent: int = 100  # part of the training after which the policy is tested
 
     def __post_init__(self) -> None:
-        require_share(self.p_conservative)
         require_ranges(self)
-        set_floats(self, "p_conservative", "position_noise_m", "tau_s")
+        set_floats(self, "position_noise_m", "tau_s")
         if self.percent not in (*SNAPSHOTS_PERCENT, 100):
             kept = ", ".join(map(str, (*SNAPSHOTS_PERCENT, 100)))
             raise InputError(f"percent must be one of {kept}, when policies are kept, not {self.percent}")
@@ -45,7 +41,7 @@ class Conditions:
     @property
     def is_single_mix(self) -> bool:
         """Whether all cases have one P(conservative), and nothing else differs from the world of the training."""
-        return isinstance(self.p_conservative, float) and self == Conditions(self.p_conservative)
+        return self.p_conservative.is_single and self == Conditions(self.p_conservative)
 
     @property
     def world(self) -> dict[str, Any]:
@@ -96,15 +92,13 @@ class Budget:
     record_p_conservative: Fraction = 0.5  # share of conservative drivers in the dataset
     ppo: PpoSettings = field(default_factory=PpoSettings)  # settings of PPO, and the steps of every policy
     methods: Many[str] = ("always_go", "ttc", "no_labels", "vae", "oracle")
-    mixes: Many[Share] = (ALL_MIXES,)  # P(conservative) in training: a policy for each
+    mixes: Many[Mix] = (ALL_MIXES,)  # P(conservative) in training: a policy for each
     seeds: Many[Seed] = (0, 1, 2)
     trials: Many[Trials] = ()
     with_shipped: bool = False  # test the shipped policies, too
 
     def __post_init__(self) -> None:
         require_distinct(self, "methods", "mixes", "seeds")
-        for mix in (self.record_p_conservative, *self.mixes):
-            require_share(mix)
         require_ranges(self)
         if self.traits is not None and self.windows == 0:
             raise InputError("windows must be at least 1, not 0")
@@ -133,7 +127,7 @@ BUDGETS = {
         traits=TRAIT_BUDGETS["quick"],
         ppo=PPO_BUDGETS["quick"],
         seeds=(0,),
-        trials=(Trials(tuple(Conditions(p) for p in P_CONSERVATIVE), 200),),
+        trials=(Trials(tuple(Conditions(Mix(p)) for p in P_CONSERVATIVE), 200),),
         with_shipped=True,
     ),
     "full": Budget(
@@ -142,7 +136,7 @@ BUDGETS = {
         methods=("always_go", "ttc", *_TRAINED),
         seeds=(0, 1, 2, 3),
         trials=(
-            Trials(tuple(Conditions(p) for p in (0.1, 0.25, 0.4, 0.6, 0.9)), 1000),
+            Trials(tuple(Conditions(Mix(p)) for p in (0.1, 0.25, 0.4, 0.6, 0.9)), 1000),
             Trials(
                 (
                     Conditions(ALL_MIXES),
@@ -157,7 +151,7 @@ BUDGETS = {
     "paper": Budget(
         traits=TRAIT_BUDGETS["paper"],
         windows=696_000,  # the number of the paper's trajectories
-        mixes=P_CONSERVATIVE,
-        trials=(Trials(tuple(Conditions(p) for p in P_CONSERVATIVE), 500),),  # paper IV-C
+        mixes=tuple(map(Mix, P_CONSERVATIVE)),
+        trials=(Trials(tuple(Conditions(Mix(p)) for p in P_CONSERVATIVE), 500),),  # paper IV-C
     ),
 }

@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from tint_sumo.config import Share
+from tint_sumo.config import Mix
 from tint_sumo.envs.episodes import episode_seed
 from tint_sumo.methods.evaluation import BATCH, case_seed
 from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene
@@ -14,7 +14,7 @@ from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.scene import SceneSimulation
 
 
-def ceiling(p_conservative: Share, episodes: int, seed: int = 0, scene: str | Scene = T_INTERSECTION) -> float:
+def ceiling(p_conservative: Mix, episodes: int, seed: int = 0, scene: str | Scene = T_INTERSECTION) -> float:
     """Share of the cases in which enough yielding drivers come in time.
 
     A careful ego enters a route only before a driver that yields. It knows all traits, never brakes on its way and

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from tint_sumo.config import is_share
 from tint_sumo.core.files import damaged, read_record, write_json
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Progress, Report
@@ -38,13 +37,13 @@ class CeilingJob:
             one.p_conservative: trials.episodes
             for trials in self.trials
             for one in trials.conditions
-            if one.is_single_mix and isinstance(one.p_conservative, float)
+            if one.is_single_mix
         }
         found: dict[str, float] = {}
         done, total = 0, sum(wanted.values())
-        for p_conservative, episodes in wanted.items():
+        for mix, episodes in wanted.items():
             report(Progress(done, total, "case"))
-            found[f"{p_conservative:g}"] = ceiling(p_conservative, episodes, CASES, self.scene)
+            found[mix.text] = ceiling(mix, episodes, CASES, self.scene)
             done += episodes
         write_json(self.out / CEILINGS_FILE, found)
         return ", ".join(f"P {p}: {percent(share)}%" for p, share in found.items())
@@ -62,6 +61,6 @@ def read_ceilings(out: Path) -> dict[float, float]:
         ceilings = {float(p): share for p, share in found.items()}
     except ValueError as error:
         raise damaged(file, "ceilings", error) from None
-    if not all(is_share(share) for one in ceilings.items() for share in one):
+    if not all(0.0 <= share <= 1.0 for one in ceilings.items() for share in one):
         raise damaged(file, "ceilings", "all numbers must lie in 0 to 1")
     return ceilings

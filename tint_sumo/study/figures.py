@@ -10,7 +10,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tint_sumo.config import ends
 from tint_sumo.core.files import whole_file
 from tint_sumo.core.percentages import percent
 from tint_sumo.envs.rows import OUTCOMES
@@ -25,7 +24,7 @@ _PANELS = 3  # panels in a row
 
 def plot_bars(rows: Sequence[Summary], file: Path) -> Path:
     """Stacked bars of success, timeout and collision as in the paper's Fig. 4, one panel per P(conservative)."""
-    panels = [(p, list(group)) for p, group in groupby(rows, key=lambda row: ends(row.conditions.p_conservative)[0])]
+    panels = [(p, list(group)) for p, group in groupby(rows, key=lambda row: row.conditions.p_conservative.low)]
     columns = min(len(panels), _PANELS)
     lines = -(-len(panels) // columns)
     height = max(len(group) for _, group in panels)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from tint_sumo.config import PpoSettings, Share, ends
+from tint_sumo.config import Mix, PpoSettings
 from tint_sumo.core.files import damaged, write_json
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Report, part_of
@@ -31,7 +31,7 @@ class TrainJob:
     """Train a policy."""
 
     method: str
-    mix: Share
+    mix: Mix
     seed: int
     settings: PpoSettings
     shipped_traits: bool  # rather than a trait model of the study
@@ -98,7 +98,7 @@ class EvaluateJob:
     """Evaluate a trained policy, a shipped one, or a rule."""
 
     method: str
-    mix: Share | None  # mix of its training; None: a rule or a shipped policy
+    mix: Mix | None  # mix of its training; None: a rule or a shipped policy
     seed: int
     trials: tuple[Trials, ...]
     out: Path  # folder of the study
@@ -158,9 +158,7 @@ class EvaluateJob:
         """Whether the policy is tested there: among drivers it was trained for, and if it was trained at all."""
         if self.mix is None:
             return conditions.percent == 100
-        low, high = ends(self.mix)
-        tested_low, tested_high = ends(conditions.p_conservative)
-        return low <= tested_low and tested_high <= high
+        return self.mix.contains(conditions.p_conservative)
 
     def _test(self, conditions: Conditions, episodes: int, report: Report) -> Evaluation:
         path = policy_path(self.out, self.method, self.mix, self.seed, conditions.percent)
@@ -174,20 +172,19 @@ class EvaluateJob:
         )
 
 
-def label(method: str, mix: Share | None, seed: int) -> str:
+def label(method: str, mix: Mix | None, seed: int) -> str:
     """Name of a policy in the files of a study."""
     if mix is None:
         return method if isinstance(find_method(method), Rule) else f"{method}-shipped"
-    low, high = ends(mix)
-    return f"{method}-P{low:g}-seed{seed}" if low == high else f"{method}-P{low:g}to{high:g}-seed{seed}"
+    return f"{method}-P{mix.text.replace(' ', '')}-seed{seed}"
 
 
-def policy_folder(method: str, mix: Share, seed: int) -> str:
+def policy_folder(method: str, mix: Mix, seed: int) -> str:
     """Folder of a policy that a study trains, relative to the study's."""
     return f"policies/{label(method, mix, seed)}"
 
 
-def policy_path(out: Path, method: str, mix: Share | None, seed: int, percent: int = 100) -> str | Path:
+def policy_path(out: Path, method: str, mix: Mix | None, seed: int, percent: int = 100) -> str | Path:
     """Where a policy of the study in ``out`` is after some percent of its training; the name of one that was given."""
     if mix is None:
         return method

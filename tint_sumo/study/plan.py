@@ -1,10 +1,10 @@
 """The whole study: record, learn traits, train and test every policy, report."""
 
-from dataclasses import asdict
 from pathlib import Path
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import claim_folder
+from tint_sumo.core.structures import plain
 from tint_sumo.dataset.recorder import record
 from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.methods.loading import shipped_policies
@@ -63,7 +63,7 @@ def run_study(
     _require_traits(budget, require_scene("a study", scene))
     jobs = plan(budget, out, scene)
     place = {} if scene == T_INTERSECTION else described(scene)
-    with claim_folder(out, {"kind": "study", **asdict(budget), **place}):
+    with claim_folder(out, {"kind": "study", **plain(budget), **place}):
         if budget.traits is not None:
             record(
                 out / DATASET,

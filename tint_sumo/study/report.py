@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tint_sumo.config import share_words
 from tint_sumo.core.files import write_text
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.statistics import difference_interval
@@ -180,11 +179,11 @@ def _world_lines(rows: Sequence[Summary]) -> Lines:
 def _number(row: Summary) -> float:
     """P(conservative) of a row's cases; NaN where each case has its own."""
     p = row.conditions.p_conservative
-    return math.nan if isinstance(p, tuple) else p
+    return p.low if p.is_single else math.nan
 
 
 def _mix(row: Summary) -> str:
-    return share_words(row.conditions.p_conservative)
+    return row.conditions.p_conservative.text
 
 
 def _with_spread(row: Summary) -> str:

@@ -1,15 +1,16 @@
 """How the policies of a study fared, as files."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tint_sumo.config import Idm, NoiseM, Seed, Share, TauS, require_share
+from tint_sumo.config import Idm, Mix, NoiseM, Seed, TauS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_record
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.reading import RESULT_BYTES
+from tint_sumo.core.structures import plain
 from tint_sumo.methods.evaluation import CASES, MAX_SEED, Case, Evaluation, StoredCase
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.folders import RESULTS
@@ -31,7 +32,7 @@ class Result:
 
     method: str
     origin: str  # TRAINED or GIVEN
-    mix: Share | None  # P(conservative) in training; None where the study did not train
+    mix: Mix | None  # P(conservative) in training; None where the study did not train
     seed: int
     tested: tuple[Measured, ...]
     case_set: int = CASES
@@ -41,13 +42,13 @@ class Result:
         return {
             "method": self.method,
             "origin": self.origin,
-            "mix": self.mix,
+            "mix": plain(self.mix),
             "seed": self.seed,
             "case_set": self.case_set,
             "scene_tau_s": self.scene_tau_s,
             "tested": [
                 {
-                    **asdict(one.conditions.resolved(self.scene_tau_s)),
+                    **plain(one.conditions.resolved(self.scene_tau_s)),
                     **one.evaluation.summary(),
                     "cases": [astuple(case) for case in one.evaluation.cases],
                 }
@@ -67,7 +68,7 @@ class Result:
 class _StoredTest:
     """What a file says of a test: its conditions, its cases, and what follows from those."""
 
-    p_conservative: Share
+    p_conservative: Mix
     position_noise_m: NoiseM
     tau_s: TauS
     percent: int
@@ -100,15 +101,11 @@ class _Stored:
 
     method: str
     origin: Literal["trained", "given"]
-    mix: Share | None
+    mix: Mix | None
     seed: Seed
     tested: tuple[_StoredTest, ...]
     case_set: Annotated[int, Range(0, MAX_SEED)] = CASES
     scene_tau_s: TauS = Idm.tau_s
-
-    def __post_init__(self) -> None:
-        if self.mix is not None:
-            require_share(self.mix)
 
 
 def read_results(out: Path) -> list[Result]:

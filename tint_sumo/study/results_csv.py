@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tint_sumo.config import Share, share_words
+from tint_sumo.config import Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.reading import RESULT_BYTES, read_file
 from tint_sumo.core.statistics import Interval
@@ -64,13 +64,13 @@ def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
         conditions, time_s = row.resolved, row.navigation_time_s
         world = (conditions.position_noise_m, conditions.tau_s, row.scene_tau_s, conditions.percent)
         p = conditions.p_conservative
-        ceiling = None if isinstance(p, tuple) else ceilings.get(p)
+        ceiling = ceilings.get(p.low) if p.is_single else None
         numbers: list[str] = []
         for outcome in OUTCOMES:
             numbers += (_percent(part) for part in (row.rate(outcome), *row.intervals[outcome], row.spread(outcome)))
         writer.writerow(
             [
-                *(row.method, row.origin, "" if row.mix is None else share_words(row.mix), share_words(p)),
+                *(row.method, row.origin, "" if row.mix is None else row.mix.text, p.text),
                 *(f"{value:g}" for value in world),
                 *numbers,
                 "" if time_s is None else f"{time_s:.2f}",
@@ -113,8 +113,8 @@ def _row(line: Mapping[str, str]) -> StoredRow:
     return StoredRow(
         line["method"],
         line["origin"],
-        _mix(mix) if mix else None,
-        Conditions(_mix(p), float(noise_m), float(tau_s), int(percent)).relative_to(float(scene_tau_s)),
+        Mix.from_text(mix) if mix else None,
+        Conditions(Mix.from_text(p), float(noise_m), float(tau_s), int(percent)).relative_to(float(scene_tau_s)),
         tuple(map(int, line["seeds"].split())),
         float(scene_tau_s),
         int(line["episodes"]),
@@ -123,12 +123,6 @@ def _row(line: Mapping[str, str]) -> StoredRow:
         spreads,
         float(time_s) if time_s else None,
     )
-
-
-def _mix(words: str) -> Share:
-    """Return what ``share_words`` wrote."""
-    low, *high = map(float, words.split(" to "))
-    return (low, high[0]) if high else low
 
 
 def _percent(share: float | None) -> str:

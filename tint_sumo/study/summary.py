@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from tint_sumo.config import Share, ends
+from tint_sumo.config import Mix
 from tint_sumo.core.statistics import Hits, Interval, rate_interval
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.methods.evaluation import Evaluation
@@ -31,7 +31,7 @@ class Summary(ABC):
 
     method: str
     origin: str
-    mix: Share | None  # P(conservative) in training
+    mix: Mix | None  # P(conservative) in training
     conditions: Conditions
     seeds: tuple[int, ...]
     scene_tau_s: float  # headway of the scene's drivers
@@ -80,8 +80,8 @@ class Summary(ABC):
         """The paper's rates in percent, empty where it has none; for its own conditions alone."""
         if not self.conditions.is_single_mix:
             return {}
-        low, _ = ends(self.conditions.p_conservative)
-        return dict(zip(OUTCOMES, RATES_PERCENT.get((self.method, low), ()), strict=False))
+        p_conservative = self.conditions.p_conservative.low
+        return dict(zip(OUTCOMES, RATES_PERCENT.get((self.method, p_conservative), ()), strict=False))
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Row(Summary):
         return {
             "method": self.method,
             "origin": self.origin,
-            "p_conservative": self.conditions.p_conservative,
+            "p_conservative": self.conditions.p_conservative.plain(),
             "position_noise_m": self.conditions.position_noise_m,
             "tau_s": self.resolved.tau_s,
             "percent": self.conditions.percent,
@@ -159,12 +159,12 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
             conditions.position_noise_m,
             abs(headway_s),  # the difference from the scene's
             headway_s,
-            isinstance(conditions.p_conservative, tuple),
+            not conditions.p_conservative.is_single,
             conditions.p_conservative,
             order.get(result.method, len(order)),
             result.method,
             result.origin,
-            str(result.mix),
+            (result.mix is None, result.mix),
         )
 
     rows = []
@@ -186,7 +186,7 @@ def at_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
 
 def over_all_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
     """The rows of other worlds and parts of the training, where every case has a mix of its own."""
-    return [row for row in rows if isinstance(row.conditions.p_conservative, tuple)]
+    return [row for row in rows if not row.conditions.p_conservative.is_single]
 
 
 def by_method(rows: Sequence[AnyRow]) -> list[AnyRow]:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tint_sumo.config import ends
 from tint_sumo.core.percentages import percent
 from tint_sumo.methods.registry import METHODS, Look, look_of
 from tint_sumo.study.jobs import smoothed_percent
@@ -37,17 +36,17 @@ class Chart:
 def outcome_chart(rows: Sequence[Summary], outcome: str) -> Chart:
     """Rates of an outcome with intervals: a line of the chart for each method, a marker for each mix."""
     titles = list(by_title(rows))
-    mixes = sorted({ends(row.conditions.p_conservative) for row in rows})
+    mixes = sorted({row.conditions.p_conservative for row in rows})
     traces, lines = [], [["method", "P(conservative)", f"{outcome} %", "95 % interval"]]
     for position, mix in enumerate(mixes):
-        own = [row for row in rows if ends(row.conditions.p_conservative) == mix]
+        own = [row for row in rows if row.conditions.p_conservative == mix]
         shift = 0.0 if len(mixes) == 1 else 0.3 * (2 * position / (len(mixes) - 1) - 1)
         shares, limits = _rates(own, outcome)
         heights = [titles.index(row.title) + shift for row in own]
         look = Look(_MIX_COLOUR, _MIX_MARKERS[position % len(_MIX_MARKERS)])
         traces.append(
             {
-                **_marks(shares, heights, f"P {mix[0]:g}", look),
+                **_marks(shares, heights, f"P {mix.low:g}", look),
                 "mode": "markers",
                 "error_x": _errors(shares, limits),
                 "text": [row.title for row in own],
@@ -57,7 +56,7 @@ def outcome_chart(rows: Sequence[Summary], outcome: str) -> Chart:
     for title, own in by_title(rows).items():
         for row in own:
             share, span = percent(row.rate(outcome)), _span(row.intervals[outcome])
-            lines.append([title, f"{ends(row.conditions.p_conservative)[0]:g}", share, span])
+            lines.append([title, f"{row.conditions.p_conservative.low:g}", share, span])
     layout = {
         "height": 120 + _ROW_PX * len(titles),
         "xaxis": {"title": {"text": f"{outcome}, % of the cases"}, "range": [-1, 101]},

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from tint_sumo.config import Share
+from tint_sumo.config import Mix
 from tint_sumo.methods.evaluation import Evaluation
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.jobs import label
@@ -21,7 +21,7 @@ class Shown:
 
     title: str
     method: str
-    mix: Share | None  # P(conservative) in training; None where the study did not train
+    mix: Mix | None  # P(conservative) in training; None where the study did not train
     seed: int
     evaluation: Evaluation  # results in all cases that it was tested on
 

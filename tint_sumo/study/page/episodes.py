@@ -7,7 +7,6 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from tint_sumo.config import share_words
 from tint_sumo.core.errors import InputError
 from tint_sumo.jobs import Workers
 from tint_sumo.methods.evaluation import Case
@@ -95,7 +94,7 @@ def player_notes(recordings: Recordings) -> str:
     parts = [
         paragraph(
             f"Each method is shown with its policy of the first seed, in the same {len(choice.cases)} of the study's "
-            f"cases (P(conservative) {share_words(choice.conditions.p_conservative)}): failures of every method, and a "
+            f"cases (P(conservative) {choice.conditions.p_conservative.text}): failures of every method, and a "
             "few successes. The policies take their likeliest actions, as they did in the tests."
         )
     ]

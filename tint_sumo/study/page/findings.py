@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-from tint_sumo.config import share_words
 from tint_sumo.core.percentages import percent
 from tint_sumo.methods.registry import METHODS, Learned
 from tint_sumo.study.budgets import Conditions
@@ -31,7 +30,7 @@ def what_came_out(rows: Sequence[Summary]) -> str:
         return ""
     shown = {title: [row for row in own if row.conditions.p_conservative in mixes] for title, own in methods.items()}
     rates = {title: sum(row.rate("success") for row in own) / len(own) for title, own in shown.items()}
-    at = f"At P {_listed([share_words(mix) for mix in mixes])}"
+    at = f"At P {_listed([mix.text for mix in mixes])}"
     if len(rates) == 1:
         ((title, rate),) = rates.items()
         return f"{at} the method {title} succeeded in {percent(rate)} % of the cases."

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 
 import tint_sumo
-from tint_sumo.config import Share
+from tint_sumo.config import Mix
 from tint_sumo.core.files import damaged, read_json, write_text
 from tint_sumo.core.progress import Progress, Report, part_of
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.reading import RESULT_BYTES
-from tint_sumo.core.structures import FieldError, build
+from tint_sumo.core.structures import FieldError, build, plain
 from tint_sumo.envs.rows import Outcome
 from tint_sumo.films.driving import Moment, drive_case
 from tint_sumo.films.trait_probe import TraitReader, fit_reader
@@ -104,7 +104,7 @@ class Recording:
     """How a policy drives in some cases, as a file."""
 
     method: str
-    mix: Share | None  # mix of its training; None: a rule or a shipped policy
+    mix: Mix | None  # mix of its training; None: a rule or a shipped policy
     seed: int
     conditions: Conditions
     cases: tuple[int, ...]
@@ -145,7 +145,7 @@ class Recording:
         identity = {
             "format": FORMAT,
             "policy": _digest(self._policy),
-            "conditions": asdict(self.conditions),
+            "conditions": plain(self.conditions),
             "cases": self.cases,
             "scene": described(self.scene),
         }

@@ -33,7 +33,7 @@ def test_policy_train(
     assert "another run" in refuse(capsys, *argv, "--p-conservative", 0.3)
     assert files(out) == before
     found = run(capsys, "policy", "evaluate", "--model", out, "--episodes", 2)
-    assert found["p_conservative"] == [0.25, 0.25]
+    assert found["p_conservative"] == 0.25
 
 
 def test_a_pickled_policy_is_read_on_request_alone(

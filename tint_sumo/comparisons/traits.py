@@ -20,7 +20,7 @@ from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_w
 from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
 from tint_sumo.study.folders import RESULTS
-from tint_sumo.traits.datasets import train_on_split
+from tint_sumo.traits.datasets import train_on
 from tint_sumo.traits.evaluation import TEST_FRACTION, Probe, linear_r2
 from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.storage import RUN_MODEL, add_to_card
@@ -167,8 +167,8 @@ class CompareJob:
         began = time.perf_counter()
         settings = replace(self.study.settings, noise_m=noise_m)
         data = self.out / _DATA
-        model = train_on_split(
-            data, windows, folder, method=self.method, settings=settings, seed=self.seed, report=report
+        model = train_on(
+            windows[train], data, folder, method=self.method, settings=settings, seed=self.seed, report=report
         )
         training_s = None if resumes else round(time.perf_counter() - began, 1)
         probe = Probe(model, windows[train], conservative[train], noise_m=noise_m, seed=self.seed)
@@ -229,9 +229,10 @@ class ContinuousJob:
         data = self.out / _CONTINUOUS_DATA
         folder = self.out / self.outputs[0]
         windows = load_windows(data)
-        model = train_on_split(
+        train, _ = split_by_episode(windows, TEST_FRACTION, self.seed)
+        model = train_on(
+            windows[train],
             data,
-            windows,
             folder,
             method=self.method,
             settings=replace(self.study.settings, epochs=self.study.continuous_epochs),

@@ -1,6 +1,7 @@
 """Trait models from a dataset folder: training on its training episodes, evaluation on the others."""
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ def train_traits(
         settings: sizes, loss weights and schedule.
         seed: of weights, order and noise, and of the split into training and test episodes.
         streaming: keep the windows in a file beside the model instead of in memory; the model is the same.
-        report: told of the progress.
+        report: called with the progress.
 
     Raises:
         InputError: no such method, no usable dataset, a negative seed, no room for the file, or ``out`` holds another
@@ -57,17 +58,20 @@ def train_traits(
     if seed < 0:
         raise InputError(f"seed must not be negative: {seed}")
     find_trait_method(method)
+    learn = partial(train_on, data=data, out=out, method=method, settings=settings, seed=seed, report=report)
     if streaming:
-        with window_file(read_training_windows(data, TEST_FRACTION, seed), out) as windows:
-            _train(data, windows, out, method=method, settings=settings, seed=seed, report=report)
+        with window_file(read_training_windows(data, TEST_FRACTION, seed), out) as stored:
+            learn(stored)
     else:
-        train_on_split(data, load_windows(data), out, method=method, settings=settings, seed=seed, report=report)
+        windows = load_windows(data)
+        chosen, _ = split_by_episode(windows, TEST_FRACTION, seed)
+        learn(windows[chosen])
     return read_card(out / "model.safetensors").entries
 
 
-def train_on_split(
+def train_on(
+    windows: Windows | WindowFile,
     data: Path,
-    windows: Windows,
     out: Path,
     *,
     method: str,
@@ -76,32 +80,10 @@ def train_on_split(
     latent_size: int = LATENT_SIZE,
     report: Report = silent,
 ) -> traits.TraitModel:
-    """``train_traits`` on all ``windows`` of the dataset ``data``, loaded before; the trained model."""
-    chosen, _ = split_by_episode(windows, TEST_FRACTION, seed)
-    return _train(
-        data,
-        windows[chosen],
-        out,
-        method=method,
-        settings=settings,
-        seed=seed,
-        latent_size=latent_size,
-        report=report,
-    )
+    """Train on all of ``windows``, which are the training windows of the dataset ``data``; return the model.
 
-
-def _train(
-    data: Path,
-    windows: Windows | WindowFile,
-    out: Path,
-    *,
-    method: str,
-    settings: TraitSettings,
-    seed: int,
-    latent_size: int = LATENT_SIZE,
-    report: Report,
-) -> traits.TraitModel:
-    """Train on all of ``windows``, which are of the dataset ``data``."""
+    Other arguments and errors are those of ``train_traits``.
+    """
     uses_labels = find_trait_method(method).uses_labels
     return train(
         windows,
@@ -119,7 +101,7 @@ def _train(
 def evaluate_traits(
     data: Path, model: str | Path, *, noise_m: float = 0.0, other_scene: bool = False
 ) -> dict[str, Any]:
-    """Accuracy of classifiers on a model's latents, in the episodes that its training left out.
+    """Return the accuracy of classifiers on a model's latents, in the episodes that its training left out.
 
     Args:
         data: folder of a dataset.
@@ -141,7 +123,7 @@ def evaluate_traits(
 def plot_traits(
     data: Path, model: str | Path, out: Path, *, noise_m: float = 0.0, other_scene: bool = False
 ) -> list[Path]:
-    """Write pictures of what a model makes of unseen episodes into the folder ``out``; the files written.
+    """Write pictures of a model's latents and reconstructions in unseen episodes into ``out``; return the files.
 
     Raises:
         InputError: no usable dataset or model.
@@ -165,23 +147,23 @@ def plot_traits(
 def _load_for_test(
     data: Path, model: str | Path, noise_m: float, other_scene: bool
 ) -> tuple[traits.TraitModel, Windows, NDArray[np.int64], int]:
-    """A model, a dataset it may be tested on, its labels, and the seed of the split into training and test."""
+    """Return a model, the windows of a dataset it may be tested on, their labels, and the seed of the split."""
     require_noise(noise_m)
     trained = traits.load(model)
     if not other_scene:
-        here = describe(data)
-        require_scene(model, here["scene"], here["scene_digest"], str(data))
+        described = describe(data)
+        require_scene(model, described["scene"], described["scene_digest"], str(data))
     _require_unseen(data, model)
     windows = load_windows(data)
     return trained, windows, load_labels(data, windows), read_card(model).seed
 
 
 def first_of_two(labels: NDArray[np.int64], method: str) -> NDArray[np.bool_]:
-    """Which drivers are of the first of two kinds: conservative, or of the first vType."""
+    """Return which drivers are of the first of two kinds: conservative, or of the first vType."""
     kinds = np.unique(labels)
     if len(kinds) != 2:
         raise InputError(
-            f"method {method} tells two kinds of drivers apart, and these windows have {len(kinds)}; "
+            f"method {method} learns two kinds of drivers, and these windows have {len(kinds)}; "
             "choose a method without labels"
         )
     return np.asarray(labels == kinds[0])
@@ -201,7 +183,7 @@ def require_used(method: str, settings: TraitSettings) -> None:
 
 
 def describe(data: Path) -> dict[str, Any]:
-    """What a model's card says about the dataset it was trained on."""
+    """Return a model card's entries about the dataset that the model was trained on."""
     content = read_manifest(data).content()
     return {key: content[key] for key in ("scene", "scene_digest", "p_conservative", "population", "seed", "windows")}
 
@@ -212,9 +194,9 @@ def _require_unseen(data: Path, model: str | Path) -> None:
     Episodes follow from P and seed; a dataset of another size has them in common, but splits them otherwise.
     """
     trained_on = read_card(model).data or {}
-    here = describe(data)
-    alike = all(trained_on.get(key) == here[key] for key in ("scene", "p_conservative", "population", "seed"))
-    if alike and trained_on.get("windows") != here["windows"]:
+    present = describe(data)
+    alike = all(trained_on.get(key) == present[key] for key in ("scene", "p_conservative", "population", "seed"))
+    if alike and trained_on.get("windows") != present["windows"]:
         raise InputError(
-            f"{data} has episodes that {model} was trained on; record another dataset with seed {here['seed'] + 1}"
+            f"{data} has episodes that {model} was trained on; record another dataset with seed {present['seed'] + 1}"
         )

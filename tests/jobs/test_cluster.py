@@ -88,11 +88,17 @@ def nodes() -> Iterator[Nodes]:
     made.end()
 
 
-@pytest.fixture
-def cluster(nodes: Nodes) -> Iterator[Executor]:
-    nodes.restore()
+@pytest.fixture(scope="module")
+def connected(nodes: Nodes) -> Iterator[Executor]:
+    """The nodes keep the processes of one connection, which would import PyTorch anew for each of them."""
     with ray_cluster(nodes.address) as found:
         yield found
+
+
+@pytest.fixture
+def cluster(nodes: Nodes, connected: Executor) -> Executor:
+    nodes.restore()
+    return connected
 
 
 @pytest.fixture(scope="module")

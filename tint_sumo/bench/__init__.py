@@ -1,4 +1,4 @@
-"""How fast all this is on the machine at hand (``tint-sumo bench``)."""
+"""Measurements of speed and memory on this machine (``tint-sumo bench``)."""
 
 from tint_sumo.bench.benchmark import QUICK, Benchmark, Sizes, run_benchmark
 

@@ -1,4 +1,4 @@
-"""How fast environments, recorder, trait models and policies are, next to SUMO's own speed and sb3-contrib's.
+"""Speed of environments, recorder, trait models and policies, beside that of SUMO alone and of sb3-contrib.
 
 Whatever is compared is measured in turns within one run, since other work on a machine slows all of it down; what
 comes out is the median of the turns.
@@ -8,10 +8,9 @@ import json
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -19,6 +18,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import psutil
 import torch
 
 from tint_sumo import ENV_IDS
@@ -38,7 +38,7 @@ from tint_sumo.simulation.timing import StepPart
 from tint_sumo.traits import TRAIT_METHODS
 from tint_sumo.traits.training import train
 
-BREAKDOWN_METHOD = "clocks around the functions that do these parts, in a pass of its own, their own cost subtracted"
+BREAKDOWN_METHOD = "clocks around the functions that do these parts, in a separate pass, without the cost of the clocks"
 
 _MIB = 2**20
 _WARM_UP_STEPS = 100  # steps of all replicas: their episodes begin together and drift apart
@@ -51,7 +51,7 @@ _ENCODED = 64 * 12  # windows: all slots of 64 intersections
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured; steps are those of all replicas together, unless said otherwise."""
+    """Sizes of the measurements; steps are those of all replicas together, unless said otherwise."""
 
     replicas: int = 64
     turns: int = 9
@@ -97,11 +97,11 @@ class Cores:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What ``run_benchmark`` found.
+    """Results of ``run_benchmark``.
 
     The floor is SUMO's ``simulationStep`` alone, step after step with nothing in between, in the same simulation with
-    the same vehicles on the street. It does less than the environment, which sees collisions where the simulation is
-    told not to look for them; the checking floor is SUMO alone in such traffic when it looks for them itself.
+    the same vehicles on the street. It does less than the environment, which sees collisions itself while SUMO does not
+    check for them; the checking floor is SUMO alone in such traffic with its check for collisions.
     """
 
     floor_env_steps_per_s: float
@@ -177,7 +177,7 @@ def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmar
 
 
 class _Driven:
-    """A Stable-Baselines3 environment under random actions."""
+    """A Stable-Baselines3 environment with random actions."""
 
     def __init__(self, sizes: Sizes, workers: int = 1, seed: int = 0, scene: str = T_INTERSECTION) -> None:
         self.env = SceneVecEnv(sizes.replicas, seed=seed, workers=workers, scene=scene)
@@ -220,7 +220,7 @@ def _driven(sizes: Sizes, workers: int = 1, seed: int = 0, scene: str = T_INTERS
 
 
 def _speed(sizes: Sizes) -> dict[str, Any]:
-    """In turns: the environment as it is, SUMO alone from the state it has reached, and SUMO with collision checks."""
+    """Measure in turns the environment, SUMO alone from the state it has reached, and SUMO with collision checks."""
     env, floor, checking = [], [], []
     for turn in range(sizes.turns):
         with _driven(sizes, seed=turn) as driven:
@@ -237,7 +237,7 @@ def _speed(sizes: Sizes) -> dict[str, Any]:
 
 
 def _scenes(sizes: Sizes) -> dict[str, Any]:
-    """In turns: the environment of each scene, and that of the T-intersection."""
+    """Measure in turns the environment of each scene, and that of the T-intersection."""
     speeds: dict[str, list[float]] = {scene: [] for scene in ENV_IDS}
     for turn in range(sizes.turns // 2 + 1):
         for scene, found in speeds.items():
@@ -253,7 +253,7 @@ def _scenes(sizes: Sizes) -> dict[str, Any]:
 
 
 def _bare_steps_per_s(simulation: SceneSimulation) -> float:
-    """Steps of SUMO in a row; the simulation loses track of its vehicles and is of no more use."""
+    """Measure steps of SUMO in a row; the simulation loses track of its vehicles and is of no more use."""
     step = simulation.link.connection.step
     start = time.perf_counter()
     for _ in range(_BARE_STEPS):
@@ -262,7 +262,7 @@ def _bare_steps_per_s(simulation: SceneSimulation) -> float:
 
 
 def _checking_steps_per_s(sizes: Sizes, seed: int) -> float:
-    """The same of a simulation that SUMO checks for collisions, after as many steps of random egos."""
+    """Measure the same where SUMO checks for collisions, after as many steps of random egos."""
     rng = np.random.default_rng(seed)
     scene = find_scene(T_INTERSECTION)
     simulation = SceneSimulation(sizes.replicas, scene, collision_options=SUMO_COLLISION_CHECK)
@@ -309,12 +309,12 @@ def _gym_speed(sizes: Sizes) -> dict[str, Any]:
 
 
 def _cores(sizes: Sizes) -> dict[str, Any]:
-    """The usual number of replicas, and that number in each worker."""
+    """Measure with the usual number of replicas, and with that number in each worker."""
     return {"cores": tuple(_workers_speed(replace(sizes, replicas=times * sizes.replicas)) for times in (1, 2))}
 
 
 def _workers_speed(sizes: Sizes) -> Cores:
-    """In turns, each apart from this process."""
+    """Measure in turns, each in another process."""
     with turns_apart(_driven_turns, sizes, 1) as one, turns_apart(_driven_turns, sizes, 2) as two:
         speeds = [(one(), two()) for _ in range(_CORES_TURNS * sizes.turns)]
     ratio = median(b / a for a, b in speeds)
@@ -328,35 +328,35 @@ def _driven_turns(sizes: Sizes, workers: int) -> Iterator[Turn]:
 
 
 def _record(sizes: Sizes) -> dict[str, Any]:
-    """The command from its start to its end, as a user waits for it."""
+    """Record a dataset with the command, from its start to its end, as a user waits for it."""
     command = [sys.executable, "-m", "tint_sumo.cli", "record", "--json", "--windows", str(sizes.windows)]
-    with tempfile.TemporaryDirectory(prefix="tint_sumo.") as folder:
+    with tempfile.TemporaryDirectory(prefix="tint_sumo.") as folder, tempfile.TemporaryFile() as printed:
         out = ["--out", str(Path(folder) / "dataset"), "--workers", str(_RECORD_WORKERS)]
         start = time.perf_counter()
-        process = subprocess.Popen([*command, *out], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        with _peak_memory(process.pid) as peak_mib:
-            printed, _ = process.communicate()
+        process = psutil.Popen([*command, *out], stdout=printed, stderr=subprocess.DEVNULL)
+        peak_mib = _peak_memory_mib(process)
         elapsed_s = time.perf_counter() - start
-    if process.returncode != 0:
-        raise RuntimeError(f"the recorder ended with exit code {process.returncode}")
-    windows = json.loads(printed.splitlines()[-1])["windows"]
-    return {"record_windows_per_s": windows / elapsed_s, "peak_memory_mib": max(peak_mib), "windows": windows}
+        if process.returncode != 0:
+            raise RuntimeError(f"the recorder ended with exit code {process.returncode}")
+        printed.seek(0)
+        windows = json.loads(printed.read().splitlines()[-1])["windows"]
+    return {"record_windows_per_s": windows / elapsed_s, "peak_memory_mib": peak_mib, "windows": windows}
 
 
 def _memory(sizes: Sizes) -> dict[str, Any]:
-    """Growth of this process over many environment steps, episodes ending and beginning all the while."""
+    """Measure how this process grows over many environment steps, in which episodes end and begin."""
     first, last = sizes.memory_env_steps
     steps, sizes_mib = 0, []
     with _driven(sizes) as driven:
         for goal in (first, last):
             while steps < goal:
                 steps += driven.turn()
-            sizes_mib.append(_memory_mib("self"))
+            sizes_mib.append(_memory_mib(psutil.Process()))
     return {"memory_growth_mib": sizes_mib[1] - sizes_mib[0]}
 
 
 def _traits(sizes: Sizes) -> dict[str, Any]:
-    """Each trait method with the sizes of the full budget and one thread of torch, as in the study's jobs."""
+    """Measure each trait method with the sizes of the full budget and one thread of torch, as in the study's jobs."""
     with single_threaded():
         training = {method: _train_windows_per_s(method, sizes.training_windows) for method in TRAIT_METHODS}
         encoding = {method: _encode_ms(method, sizes.turns) for method in TRAIT_METHODS}
@@ -396,7 +396,7 @@ def _encode_ms(method: str, turns: int) -> float:
 
 
 def _steady_windows(windows: int) -> Windows:
-    """Full windows of drivers at a steady speed; what stands in windows does not change how long they take."""
+    """Return full windows of drivers at a steady speed; their content does not change how long they take."""
     rng = np.random.default_rng(0)
     offset_m = rng.uniform(0.2, 0.3, (windows, 1)) * np.arange(WINDOW_STEPS)
     gap_m = np.broadcast_to(rng.uniform(3.0, 20.0, (windows, 1)), offset_m.shape)
@@ -410,46 +410,21 @@ def _steady_windows(windows: int) -> Windows:
     )
 
 
-@contextmanager
-def _peak_memory(process_id: int) -> Iterator[list[float]]:
-    """Sample the memory of a process and its descendants together; at least one sample."""
-    samples = [_tree_memory_mib(process_id)]
-    ended = threading.Event()
+def _peak_memory_mib(process: psutil.Popen) -> float:
+    """Wait for a process, and return the peak of the memory of it and its descendants together."""
+    peak_mib = 0.0
+    while True:
+        with suppress(psutil.NoSuchProcess):
+            tree = (process, *process.children(recursive=True))
+            peak_mib = max(peak_mib, sum(map(_memory_mib, tree)))
+        with suppress(psutil.TimeoutExpired):
+            process.wait(_SAMPLING_S)
+            return peak_mib
 
-    def sample() -> None:
-        while not ended.wait(_SAMPLING_S):
-            samples.append(_tree_memory_mib(process_id))
 
-    thread = threading.Thread(target=sample)
-    thread.start()
+def _memory_mib(process: psutil.Process) -> float:
+    """Return the memory of a process, with its part of what it shares with others (Linux's PSS); 0 if it has ended."""
     try:
-        yield samples
-    finally:
-        ended.set()
-        thread.join()
-
-
-def _tree_memory_mib(process_id: int) -> float:
-    children: dict[int, list[int]] = {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        parent = _numbers(folder.name, "status").get("PPid")
-        if parent is not None:
-            children.setdefault(int(parent), []).append(int(folder.name))
-    tree = [process_id]
-    for one in tree:
-        tree += children.get(one, [])
-    return sum(_memory_mib(str(one)) for one in tree)
-
-
-def _memory_mib(process: str) -> float:
-    """Memory of a process, with its part of what it shares with others (Linux's PSS)."""
-    return int(_numbers(process, "smaps_rollup").get("Pss", "0 kB").split()[0]) * 1024 / _MIB
-
-
-def _numbers(process: str, file: str) -> dict[str, str]:
-    """Return what a file of Linux says about a process; empty if the process has ended."""
-    try:
-        lines = Path("/proc", process, file).read_text(encoding="utf-8").splitlines()
-    except (FileNotFoundError, ProcessLookupError):
-        return {}
-    return {key: value.strip() for key, _, value in (line.partition(":") for line in lines)}
+        return float(process.memory_full_info().pss / _MIB)
+    except psutil.NoSuchProcess:
+        return 0.0

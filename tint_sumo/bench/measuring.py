@@ -1,4 +1,7 @@
-"""What measurements of several kinds need: clocks, one thread of torch, turns in processes of their own."""
+"""Tools of several measurements: clocks around functions, and turns in other processes.
+
+cProfile makes an environment step a fifth slower, at the expense of what Python does; these clocks subtract their cost.
+"""
 
 import time
 from collections.abc import Callable, Iterator
@@ -9,18 +12,18 @@ from typing import Any
 from tint_sumo.core.processes import result_of, start_worker, value_of
 from tint_sumo.simulation.timing import marked_methods
 
-Turn = Callable[[], float]  # measures once more and returns what it found
+Turn = Callable[[], float]  # measures once more and returns the result
 
 
 class Clocks:
-    """Clocks around functions; what is spent in one within another one counts for the inner one alone."""
+    """Clocks around functions; time in a clocked function that another one calls counts for the inner one alone."""
 
     def __init__(self) -> None:
         self.spent_s: dict[str, float] = {}
         self._within_s = [0.0]  # spent in clocked functions, at every depth of calls
         self._cost_s = 0.0
         idle = self.around(lambda: None, "idle")
-        self._cost_s = min(_call_s(idle) for _ in range(10))  # whatever interrupts a clock is no cost of its own
+        self._cost_s = min(_call_s(idle) for _ in range(10))  # the least: other work may interrupt a clock
 
     def watch(self, *owners: object) -> None:
         """Put clocks around the methods of these objects that are marked as parts of a step, for good."""
@@ -52,7 +55,7 @@ def _call_s(function: Callable[[], Any], calls: int = 100) -> float:
 
 @contextmanager
 def turns_apart(make: Callable[..., AbstractContextManager[Turn]], *arguments: Any) -> Iterator[Turn]:
-    """The turns of ``make(*arguments)``, taken in a process of its own, which waits between them."""
+    """Give the turns of ``make(*arguments)``, taken in another process, which waits between them."""
     pipe, process = start_worker(_serve_turns, make, *arguments, daemon=False)
 
     def turn() -> float:

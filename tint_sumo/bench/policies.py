@@ -1,4 +1,4 @@
-"""How fast policies train, next to sb3-contrib's recurrent PPO where it is installed, and how fast they decide."""
+"""Speed of policies in training, beside sb3-contrib's recurrent PPO where it is installed, and time of a decision."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -24,14 +24,14 @@ from tint_sumo.policy import ActionRepeat, GruPolicy, StreamingTraits, TraitObse
 INSTALL_SB3_CONTRIB = "sb3-contrib is not installed: pip install sb3-contrib"
 DECISION_METHOD = (
     "a decision: with one intersection and one thread, trait inference at every simulation step of a decision and one "
-    "call of the network, with all that wraps them; the environment's own steps do not count"
+    "call of the network, with all wrappers; steps of the environment itself do not count"
 )
 
 MakeModel = Callable[[VecEnv, int, PpoSettings], OnPolicyAlgorithm]
 
 
 def training_speed(settings: PpoSettings, turns: int) -> dict[str, float | None]:
-    """In turns, each in a process of its own: a rollout of our PPO and its updates, and the same of sb3-contrib's.
+    """Measure in turns, each in another process, a rollout of our PPO and its updates, and the same of sb3-contrib's.
 
     The first rollout of each, in which all episodes begin together, does not count.
     """
@@ -51,7 +51,7 @@ def training_speed(settings: PpoSettings, turns: int) -> dict[str, float | None]
 
 @contextmanager
 def _training(make: MakeModel, settings: PpoSettings) -> Iterator[Turn]:
-    """Decisions per second of one more rollout, updates included, in a training as the study has it."""
+    """Give turns that measure the decisions per second of one more rollout with its updates, as in the study."""
     venv = training_venv(find_learned("no_labels"), None, ALL_MIXES, settings)
     with closing(venv), single_threaded():
         model = make(venv, 0, settings)
@@ -67,7 +67,7 @@ def _training(make: MakeModel, settings: PpoSettings) -> Iterator[Turn]:
 
 
 def _contrib_model(venv: VecEnv, seed: int, settings: PpoSettings) -> OnPolicyAlgorithm:
-    """Gradient steps as many and as large, LSTMs and heads as wide as ours; it has no attention, so it does less."""
+    """Return a model with as many and as large gradient steps, LSTMs and heads; without attention it does less."""
     from sb3_contrib import RecurrentPPO  # noqa: PLC0415 - optional
 
     heads = list(settings.policy.head_sizes)
@@ -83,7 +83,7 @@ def _contrib_model(venv: VecEnv, seed: int, settings: PpoSettings) -> OnPolicyAl
 
 
 def decision_ms(settings: PpoSettings, decisions: int) -> float:
-    """Median time of a decision (``DECISION_METHOD``) with streaming traits and a network as large as the study's."""
+    """Return the median time of a decision (``DECISION_METHOD``) with streaming traits and the study's network."""
     env = SceneVecEnv(1, seed=0, tracks=True)
     observed = TraitObservation(env, StreamingTraits(traits.load("cross_window")))
     with closing(ActionRepeat(observed, settings.action_repeat)) as venv, single_threaded():
@@ -99,7 +99,7 @@ def decision_ms(settings: PpoSettings, decisions: int) -> float:
 
 
 def _driving(policy: GruPolicy, venv: VecEnv) -> Callable[[], None]:
-    """Call it for one more decision."""
+    """Return a function that makes one more decision."""
     observation: Any = venv.reset()
     state, starts = None, np.ones(venv.num_envs, bool)
 

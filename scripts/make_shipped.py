@@ -25,7 +25,7 @@ from tint_sumo.comparisons.traits import TraitStudy
 from tint_sumo.comparisons.traits_report import plot_noise
 from tint_sumo.core.files import write_json
 from tint_sumo.envs import SceneEnv
-from tint_sumo.methods.registry import Learned, find_method
+from tint_sumo.methods.registry import Learned, find_method, needed_encoders
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.scenes import T_INTERSECTION
@@ -44,7 +44,7 @@ TITLE_PX = 26
 CLEAR_M = 0.8
 DATA = Path(__file__).resolve().parents[1] / "data"
 IMAGES = DATA / "images"
-SHIPPED_TRAITS = {"vae": 0.0, "cross_window": 0.05, "morton": 0.0, "classifier": 0.0}  # and the noise in training, m
+TRAINING_NOISE_M = {"cross_window": 0.05}  # of the shipped trait models that are trained with noise
 
 
 def run(*arguments: str) -> None:
@@ -59,7 +59,8 @@ def make_traits(work: Path) -> None:
     run("traits", "study", "--out", str(study))
     for name in ("traits.csv", "traits.md", "traits_seeds.csv", "traits_continuous.csv"):
         copy(study / name, DATA / "results" / name)
-    for method, noise_m in SHIPPED_TRAITS.items():
+    for method in needed_encoders():
+        noise_m = TRAINING_NOISE_M.get(method, 0.0)
         model = DATA / "models" / f"{method}.safetensors"
         trained = study / "models" / f"{method}-noise{noise_m:g}-seed0"
         for suffix in (".safetensors", ".json"):

@@ -13,6 +13,7 @@ from tint_sumo.cli import main
 from tint_sumo.config import NO_LEADER_GAP_M, PPO_BUDGETS, STEP_S
 from tint_sumo.core.percentages import percent
 from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.methods.registry import find_learned, learned_methods
 from tint_sumo.study.results_csv import read_csv
 from tint_sumo.study.summary import Summary, at_mixes, by_title, over_all_mixes
 from tint_sumo.traits.storage import read_card
@@ -22,7 +23,7 @@ README = ROOT / "README.md"
 DOCS = ROOT / "docs"
 RESULTS = ROOT / "data" / "results"
 _TABLE = re.compile(r"(?:^\|.*\|\n)+", re.MULTILINE)
-_INFERRING = ("morton", "vae", "cross_window", "streaming", "streaming_critic", "ma")
+_INFERRING = [name for name in learned_methods() if find_learned(name).encoder and find_learned(name).attention]
 
 
 @pytest.mark.parametrize(

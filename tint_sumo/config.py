@@ -102,6 +102,7 @@ class DriverProfile:
 CONSERVATIVE = DriverProfile("conservative", (2.4, 2.4), (0.5, 0.7), (4.0, 6.0), True, "40,90,200")
 AGGRESSIVE = DriverProfile("aggressive", (3.0, 3.0), (0.3, 0.5), (3.0, 5.0), False, "200,40,40")
 DRIVER_PROFILES = (CONSERVATIVE, AGGRESSIVE)
+KINDS = len(DRIVER_PROFILES)  # of drivers that labels can tell apart: conservative and aggressive
 CONSERVATIVE_LABEL = DRIVER_PROFILES.index(CONSERVATIVE)  # labels are numbers of profiles in their population
 CONTINUOUS = DriverProfile("continuous", (2.0, 3.4), (0.2, 0.8), (3.0, 6.0), True, "90,90,90")  # no classes at all
 

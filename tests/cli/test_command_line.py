@@ -104,7 +104,6 @@ def test_argument_errors_exit_with_2(argv: list[str], capsys: pytest.CaptureFixt
         ),
         ("policy train --method magic --out OUT", "unknown method 'magic'"),
         ("policy train --method ttc --out OUT", "hand-written rule"),
-        ("policy train --method ours --out OUT", "ours is now called vae"),
         ("policy train --method oracle --p-conservative -0.1 --out OUT", "p_conservative"),
         ("policy train --method oracle --p-conservative 0.6 0.2 --out OUT", "from low to high"),
         ("policy train --method oracle --p-conservative 0.1 0.2 0.3 --out OUT", "a probability in [0, 1], or two"),

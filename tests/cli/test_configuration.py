@@ -27,6 +27,7 @@ COMMAND_LINES = (
     "record --out data --sumocfg mine.sumocfg",
     "record --out s3://bucket/data --executor ray --address ray://head:10001",
     "dataset inspect data --figure picture.png --verify",
+    "tracks inspect tracks.csv --format ngsim --figure tracks.png",
     "traits train --data data --out model --method morton --budget paper --noise 0.1",
     "traits evaluate --data data --model vae --noise 1e-3 --other-scene",
     "traits plot --data data --model vae --out pictures",
@@ -302,7 +303,7 @@ def test_policies_and_films_of_other_drivers(
     monkeypatch.chdir(tmp_path)
     scene = "scene:\n  name: three\n  time_limit_s: 1\n" + DRIVERS.replace("\n", "\n  ")
     file = written(tmp_path, SMALL + scene)
-    message = "method oracle is told which of two kinds of drivers each one is of, and scene three has 3"
+    message = "method oracle needs exactly two kinds of drivers, and scene three has 3"
     assert message in refuse(capsys, "policy", "train", "--method", "oracle", "--config", file)
     run(capsys, "policy", "train", "--method", "no_labels", "--config", file)
     assert "a film needs drivers of 2 profiles" in refuse(capsys, "render", "--model", "run", "--out", "film.png")

@@ -145,7 +145,7 @@ def test_a_trait_model_learns_from_it(merge_data: Path, tmp_path: Path) -> None:
 
 def test_the_classifier_needs_two_vtypes(user_network: Make, tmp_path: Path) -> None:
     record_sumocfg(user_network("braunschweig").sumocfg, tmp_path / "d", 100, progress=False)
-    with pytest.raises(InputError, match="learns two kinds of drivers, and these windows have 3; choose"):
+    with pytest.raises(InputError, match="exactly two kinds of drivers, and the dataset has 3; choose"):
         train_traits(tmp_path / "d", tmp_path / "c", method="classifier", settings=TINY)
     assert not (tmp_path / "c").exists()
 

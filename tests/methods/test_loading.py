@@ -176,11 +176,6 @@ def test_a_wrong_card(run: Path, changes: dict[str, Any]) -> None:
     assert "policy.json is not the card of a policy" in refused(run)
 
 
-def test_a_card_with_a_name_of_the_past(run: Path) -> None:
-    change_card(run, method="ours")
-    assert "ours is now called vae" in refused(run)
-
-
 def test_a_missing_trait_model(run_with_traits: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tint_sumo.traits.storage.shipped", lambda _: tmp_path / "none")
     (run_with_traits / "traits.safetensors").unlink()

@@ -1,29 +1,33 @@
-from pathlib import Path
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from tint_sumo import traits
 from tint_sumo.config import LATENT_SIZE, TraitSettings
-from tint_sumo.core.errors import RENAMED_METHODS, InputError
-from tint_sumo.methods.loading import load_policy
+from tint_sumo.core.errors import InputError
 from tint_sumo.methods.registry import (
     METHODS,
     Learned,
     Look,
     Rule,
+    always_go,
     find_learned,
     find_method,
+    learned_methods,
     look_of,
     look_of_encoder,
+    needed_encoders,
+    no_traits,
     register,
 )
-from tint_sumo.methods.rules import AlwaysGo
 from tint_sumo.policy import ClassifierTraits, EncoderTraits, NoTraits, OracleTraits, StreamingTraits
 from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.traits import TraitModel
 
-LEARNED = [name for name, method in METHODS.items() if isinstance(method, Learned)]
+LEARNED = learned_methods()
 SMALL = TraitSettings(embedding_sizes=(), hidden_size=4, encoder_output_size=4, decoder_output_size=4)
 
 
@@ -135,7 +139,7 @@ def test_trait_methods_look_like_the_policies_that_use_them() -> None:
     assert look_of_encoder("unknown") == look_of("unknown") == Look()
 
 
-@pytest.mark.parametrize("twin", [Rule("ttc", "another", lambda _: AlwaysGo()), Learned("ttc", "another", NoTraits)])
+@pytest.mark.parametrize("twin", [Rule("ttc", "another", always_go), Learned("ttc", "another", no_traits)])
 def test_a_name_is_taken_once(twin: Rule | Learned) -> None:
     with pytest.raises(ValueError, match="two methods are called 'ttc'"):
         register(twin)
@@ -144,7 +148,7 @@ def test_a_name_is_taken_once(twin: Rule | Learned) -> None:
 
 def test_a_new_method_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tint_sumo.methods.registry.METHODS", dict(METHODS))
-    new = register(Learned("guess", "a guess", NoTraits))
+    new = register(Learned("guess", "a guess", no_traits))
     assert find_method("guess") is find_learned("guess") is new
     assert "guess" not in METHODS
 
@@ -154,23 +158,32 @@ def test_unknown_methods_are_answered_with_the_known_ones() -> None:
         find_method("magic")
 
 
-@pytest.mark.parametrize(("old", "new"), RENAMED_METHODS.items())
-def test_names_of_the_past_are_answered_with_those_of_today(old: str, new: str) -> None:
-    assert new in METHODS
-    for find in (find_method, find_learned, load_policy):
-        with pytest.raises(InputError, match=f"^{old} is now called {new}; use that name$"):
-            find(old)
-
-
-def test_a_folder_with_a_name_of_the_past_is_still_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "ours").mkdir()
-    (tmp_path / "ours" / "policy.safetensors").write_bytes(b"")
-    with pytest.raises(InputError, match=r"no file ours/policy\.json"):
-        load_policy("ours")
-
-
 def test_rules_are_not_trained() -> None:
     with pytest.raises(InputError, match=r"hand-written rule and needs no training; choose one of: no_labels, morton"):
         find_learned("ttc")
     assert find_learned("vae").encoder == "vae"
+
+
+def test_a_new_method_is_one_entry() -> None:
+    """Help texts, the study's budgets and the list of shipped policies follow from the registry, in a new process."""
+    code = """
+from tint_sumo.methods import registry
+registry.register(registry.Learned("guess", "a guess", registry.no_traits, encoder="morton"))
+import sys
+assert not {"torch", "numba", "libsumo", "stable_baselines3"} & set(sys.modules)
+from tint_sumo.study.budgets import BUDGETS
+assert BUDGETS["full"].methods[-1] == "guess"
+from tint_sumo.cli import main
+try:
+    main(["policy", "train", "--help"])
+except SystemExit:
+    main(["policy", "train", "--method", "nobody", "--out", "nowhere"])
+"""
+    wide = {**os.environ, "COLUMNS": "400"}
+    done = subprocess.run([sys.executable, "-c", code], env=wide, capture_output=True, text=True, check=False)
+    assert "oracle, guess" in " ".join(done.stdout.split()), done.stderr
+    assert done.stderr.rstrip().endswith("oracle, guess")
+
+
+def test_trait_models_that_methods_need_are_named_once() -> None:
+    assert needed_encoders() == ("morton", "vae", "cross_window", "classifier")

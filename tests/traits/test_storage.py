@@ -7,7 +7,6 @@ import torch
 from tint_sumo.core.errors import InputError
 from tint_sumo.traits import load, storage
 from tint_sumo.traits.input_range import InputRange
-from tint_sumo.traits.model import find_trait_method
 from tint_sumo.traits.storage import add_to_card, read_card, save
 from tint_sumo.traits.vae import Vae
 
@@ -122,14 +121,6 @@ def test_the_card_tells_what_it_was_given_and_takes_additions(saved):
     card = read_card(saved)
     assert (card.method, card.latent_size, card.seed, card.entries["accuracy"]) == ("vae", 2, 4, 0.99)
     assert load(saved).latent_size == 2
-
-
-@pytest.mark.parametrize(("old", "new"), [("ours", "vae"), ("ours_plus", "cross_window")])
-def test_names_of_the_past_are_answered_with_those_of_today(old, new):
-    with pytest.raises(InputError, match=f"^{old} is now called {new}; use that name$"):
-        load(old)
-    with pytest.raises(InputError, match=f"^{old} is now called {new}; use that name$"):
-        find_trait_method(old)
 
 
 def test_a_card_keeps_the_range_of_the_training_windows(saved, street):

@@ -13,9 +13,12 @@ from tint_sumo.core.percentages import percent
 from tint_sumo.core.ranges import Processes, Range
 from tint_sumo.core.stores import name_in, working_folder
 from tint_sumo.core.structures import Many, plain
+from tint_sumo.methods.registry import learned_methods
 
 if TYPE_CHECKING:
     from tint_sumo.methods.loading import Contender
+
+_LEARNED = ", ".join(learned_methods())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,8 +27,7 @@ class TrainPolicy(Command):
 
     after_interrupt: ClassVar[str] = RESUMES
 
-    method: str
-    """Learned method: no_labels, morton, vae, no_attention, cross_window, streaming, streaming_critic, ma or oracle."""
+    method: Annotated[str, arg(help=f"Learned method: {_LEARNED}.")]
     out: Path
     """Folder for the policy, its card, the training's curve and the TensorBoard log."""
     p_conservative: MixFlag = (0.1, 0.9)
@@ -146,8 +148,7 @@ class SweepPolicy(SpreadCommand):
     network's settings begin with policy, such as policy.hidden_size=32,64."""
     out: FolderOrUrl
     """Folder of the sweep, or a URL such as s3://bucket/folder."""
-    methods: Many[str] = ("oracle",)
-    """Learned methods: no_labels, morton, vae, no_attention, cross_window, streaming, streaming_critic, ma, oracle."""
+    methods: Annotated[Many[str], arg(help=f"Learned methods: {_LEARNED}.")] = ("oracle",)
     seeds: Many[Seed] = (0,)
     """Seeds of the trainings, 0 to 1000."""
     p_conservative: MixFlag = (0.1, 0.9)

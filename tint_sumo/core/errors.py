@@ -69,12 +69,3 @@ def system_problem(error: OSError) -> str:
     parts = (str(error.filename), problem) if error.filename is not None else (problem,)
     remedy = _REMEDIES.get(error.errno or 0, "check the path" if error.filename is not None else "")
     return "; ".join(part for part in (": ".join(parts), remedy) if part)
-
-
-RENAMED_METHODS = {"ours": "vae", "ours_plus": "cross_window"}  # what methods were called up to version 0.1
-
-
-def refuse_old_name(name: object) -> None:
-    """Raise InputError where a method or model is called by a name of the past."""
-    if str(name) in RENAMED_METHODS:
-        raise InputError(f"{name!s} is now called {RENAMED_METHODS[str(name)]}; use that name")

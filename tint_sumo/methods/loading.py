@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from tint_sumo import traits
 from tint_sumo.config import LATENT_SIZE, Mix, Traffic
 from tint_sumo.core.determinism import preserved_random_state
-from tint_sumo.core.errors import InputError, refuse_old_name
+from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
 from tint_sumo.methods.registry import METHODS, Learned, Policy, Rule, find_learned
 from tint_sumo.methods.rules import ACTIONS as RULE_ACTIONS
@@ -167,7 +167,6 @@ def find_policy(name_or_path: str | Path) -> Path:
     for stem in (named, given / POLICY, weights):
         if stem.name and weights_file(stem).is_file():
             return stem
-    refuse_old_name(name_or_path)
     if (given / "run.json").exists():
         raise InputError(f"{given} holds a run that is not finished; repeat its command to finish it")
     rules = [name for name, method in METHODS.items() if isinstance(method, Rule)]
@@ -184,7 +183,6 @@ def shipped_policies() -> list[str]:
 
 def _checked_card(stem: Path) -> dict[str, Any]:
     card = read_policy_card(stem)
-    refuse_old_name(card.get("method"))
     method = METHODS.get(str(card.get("method")))
     settings = card.get("settings")
     mix = card.get("p_conservative")

@@ -1,25 +1,25 @@
-"""The methods of the study. A new one is one entry here (and its rule or trait source)."""
+"""The methods of the study. A new one is one entry here, and its rule or trait source.
+
+Help texts, tables, figures, the study's budgets and the list of shipped policies follow from the entries. What an entry
+needs is imported when it is used: help texts must not wait for torch.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.config import PpoSettings
-from tint_sumo.core.errors import InputError, find_named, refuse_old_name
-from tint_sumo.methods.rules import AlwaysGo, TimeToCollision
-from tint_sumo.policy.trait_sources import (
-    ClassifierTraits,
-    EncoderTraits,
-    NoTraits,
-    OracleTraits,
-    StreamingTraits,
-    TraitSource,
-)
-from tint_sumo.scenes import AnyScene
-from tint_sumo.traits import TraitModel
+from tint_sumo.core.errors import InputError, find_named
+
+if TYPE_CHECKING:
+    from tint_sumo.policy.trait_sources import Encoder, TraitSource
+    from tint_sumo.scenes import AnyScene
+    from tint_sumo.traits import TraitModel
+
+# ruff: noqa: PLC0415
 
 
 class Policy(Protocol):
@@ -54,7 +54,7 @@ class Rule:
 
     name: str
     title: str  # name in tables and figures
-    make: Callable[[AnyScene], Policy]
+    make: "Callable[[AnyScene], Policy]"
     look: Look = Look()
 
 
@@ -64,7 +64,7 @@ class Learned:
 
     name: str
     title: str
-    source: Callable[..., TraitSource]  # takes the trait model if there is one
+    source: "Callable[..., TraitSource]"  # takes the trait model if there is one
     encoder: str | None = None  # trait method (``tint_sumo.traits.TRAIT_METHODS``) whose model it needs
     attention: bool = True
     critic_sees_true_traits: bool = False  # only in training; the policy itself never sees them
@@ -74,10 +74,10 @@ class Learned:
     @property
     def sees_true_traits(self) -> bool:
         """Whether its training does."""
-        return self.source is OracleTraits or self.critic_sees_true_traits or self.trained_as is not None
+        return self.source is true_traits or self.critic_sees_true_traits or self.trained_as is not None
 
-    def make_source(self, encoder: TraitModel | None) -> TraitSource:
-        """A new source of traits."""
+    def make_source(self, encoder: "TraitModel | None") -> "TraitSource":
+        """Return a new source of traits."""
         return self.source() if encoder is None else self.source(encoder)
 
     def settings_of(self, settings: PpoSettings) -> PpoSettings:
@@ -112,26 +112,36 @@ def register(method: Method) -> Method:
 
 
 def find_method(name: str) -> Method:
-    """The method called ``name``.
+    """Return the method called ``name``.
 
     Raises:
         InputError: there is none.
     """
-    refuse_old_name(name)
     return find_named("method", name, METHODS)
 
 
 def find_learned(name: str) -> Learned:
-    """The same for methods that learn.
+    """Return the learned method called ``name``.
 
     Raises:
         InputError: there is none, or it is a hand-written rule.
     """
     method = find_method(name)
     if isinstance(method, Rule):
-        learned = ", ".join(one.name for one in METHODS.values() if isinstance(one, Learned))
-        raise InputError(f"{name!r} is a hand-written rule and needs no training; choose one of: {learned}")
+        known = ", ".join(learned_methods())
+        raise InputError(f"{name!r} is a hand-written rule and needs no training; choose one of: {known}")
     return method
+
+
+def learned_methods() -> tuple[str, ...]:
+    """Return the names of all methods that learn."""
+    return tuple(name for name, method in METHODS.items() if isinstance(method, Learned))
+
+
+def needed_encoders() -> tuple[str, ...]:
+    """Return the names of the trait methods whose models the learned methods need, each of them once."""
+    encoders = (method.encoder for method in METHODS.values() if isinstance(method, Learned))
+    return tuple(dict.fromkeys(name for name in encoders if name is not None))
 
 
 def with_shared_trainings(names: Iterable[str]) -> list[str]:
@@ -152,34 +162,79 @@ def look_of_encoder(name: str) -> Look:
     return next((one.look for one in users), Look())
 
 
-register(Rule("always_go", "always go", lambda _: AlwaysGo(), look=Look("#5444fd", "o", ":")))
-register(Rule("ttc", "time to collision", lambda scene: TimeToCollision(scene=scene), look=Look("#8f9047", "s", ":")))
-register(Learned("no_labels", "no labels", NoTraits, look=Look("#1793fc", "D", "-")))
-register(Learned("morton", "Morton", EncoderTraits, encoder="morton", look=Look("#d77e0b", "^", "--")))
-register(Learned("vae", "paper's method", EncoderTraits, encoder="vae", look=Look("#197847", "v", "-")))
+# Rules and trait sources by the modules that hold them.
+
+
+def always_go(_: "AnyScene") -> Policy:
+    from tint_sumo.methods.rules import AlwaysGo
+
+    return AlwaysGo()
+
+
+def time_to_collision(scene: "AnyScene") -> Policy:
+    from tint_sumo.methods.rules import TimeToCollision
+
+    return TimeToCollision(scene=scene)
+
+
+def no_traits() -> "TraitSource":
+    from tint_sumo.policy.trait_sources import NoTraits
+
+    return NoTraits()
+
+
+def window_traits(model: "Encoder") -> "TraitSource":
+    from tint_sumo.policy.trait_sources import EncoderTraits
+
+    return EncoderTraits(model)
+
+
+def classified_traits(model: "Encoder") -> "TraitSource":
+    from tint_sumo.policy.trait_sources import ClassifierTraits
+
+    return ClassifierTraits(model)
+
+
+def streaming_traits(model: "TraitModel") -> "TraitSource":
+    from tint_sumo.policy.trait_sources import StreamingTraits
+
+    return StreamingTraits(model)
+
+
+def true_traits() -> "TraitSource":
+    from tint_sumo.policy.trait_sources import OracleTraits
+
+    return OracleTraits()
+
+
+register(Rule("always_go", "always go", always_go, look=Look("#5444fd", "o", ":")))
+register(Rule("ttc", "time to collision", time_to_collision, look=Look("#8f9047", "s", ":")))
+register(Learned("no_labels", "no labels", no_traits, look=Look("#1793fc", "D", "-")))
+register(Learned("morton", "Morton", window_traits, encoder="morton", look=Look("#d77e0b", "^", "--")))
+register(Learned("vae", "paper's method", window_traits, encoder="vae", look=Look("#197847", "v", "-")))
 register(
     Learned(
         "no_attention",
         "paper's, no attention",
-        EncoderTraits,
+        window_traits,
         encoder="vae",
         attention=False,
         look=Look("#ce1306", "P", "--"),
     )
 )
-register(Learned("cross_window", "cross-window", EncoderTraits, encoder="cross_window", look=Look("#884bb5", "*", "-")))
-register(Learned("streaming", "streaming", StreamingTraits, encoder="cross_window", look=Look("#c0867a", "X", "-.")))
+register(Learned("cross_window", "cross-window", window_traits, encoder="cross_window", look=Look("#884bb5", "*", "-")))
+register(Learned("streaming", "streaming", streaming_traits, encoder="cross_window", look=Look("#c0867a", "X", "-.")))
 register(
     Learned(
         "streaming_critic",
         "streaming, informed critic",
-        StreamingTraits,
+        streaming_traits,
         encoder="cross_window",
         critic_sees_true_traits=True,
         look=Look("#fc329e", "h", "-."),
     )
 )
 register(
-    Learned("ma", "Ma", ClassifierTraits, encoder="classifier", trained_as="oracle", look=Look("#15a1bb", "<", "--"))
+    Learned("ma", "Ma", classified_traits, encoder="classifier", trained_as="oracle", look=Look("#15a1bb", "<", "--"))
 )
-register(Learned("oracle", "oracle", OracleTraits, look=Look("#646971", ">", "-")))
+register(Learned("oracle", "oracle", true_traits, look=Look("#646971", ">", "-")))

@@ -34,6 +34,7 @@ from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
 from tint_sumo.policy.wrappers import policy_venv
 from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, described, find_scene
+from tint_sumo.scenes.drivers import require_two_kinds
 from tint_sumo.traits import TraitModel
 from tint_sumo.traits.storage import read_card, require_scene, save
 
@@ -172,11 +173,8 @@ def _require_drivers(learned: Learned, p_conservative: Mix | None, scene: AnySce
     played = T_INTERSECTION if scene == ALL_SCENES else scene
     found = find_scene(played)
     kinds = len(found.with_drivers(p_conservative, None).traits)
-    if learned.sees_true_traits and kinds != 2:
-        raise InputError(
-            f"method {learned.name} is told which of two kinds of drivers each one is of, and scene {found.name} has "
-            f"{kinds}; choose another method"
-        )
+    if learned.sees_true_traits:
+        require_two_kinds(kinds, learned.name, f"scene {found.name}")
 
 
 def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | None:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import torch
 
-from tint_sumo.config import LATENT_SIZE, STEP_S, WINDOW_STEPS
+from tint_sumo.config import KINDS, LATENT_SIZE, STEP_S, WINDOW_STEPS
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.windows import cut_windows
 from tint_sumo.traits.classifier import Classifier
@@ -72,7 +72,7 @@ class OracleTraits(TraitSource):
         profiles: how many there are in the scene's population.
     """
 
-    def __init__(self, profiles: int = 2) -> None:
+    def __init__(self, profiles: int = KINDS) -> None:
         self.size = profiles
 
     def begin(self, frame: Frame) -> None:
@@ -179,6 +179,7 @@ class ClassifierTraits(EncoderTraits):
     With a policy trained on true traits this is the pipeline of Ma et al. (2020) as the paper has it (IV-C).
     """
 
+    size = KINDS
     model: Classifier
 
     def _told(self, latents: torch.Tensor) -> np.ndarray:

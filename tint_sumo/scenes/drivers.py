@@ -8,10 +8,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tint_sumo.config import DriverProfile, Idm, Population, VehicleShape
+from tint_sumo.config import KINDS, DriverProfile, Idm, Population, VehicleShape
+from tint_sumo.core.errors import InputError
 
 DISTRIBUTION_ID = "drivers"
 EGO_TYPE = "ego"
+
+
+def require_two_kinds(kinds: int, method: str, drivers: str) -> None:
+    """Raise InputError unless there are exactly two kinds of drivers, as methods that use labels need.
+
+    Args:
+        kinds: number of kinds.
+        method: name of the method.
+        drivers: whose drivers they are, for the message.
+    """
+    if kinds != KINDS:
+        raise InputError(
+            f"method {method} needs exactly two kinds of drivers, and {drivers} has {kinds}; choose another method"
+        )
 
 
 @dataclass(frozen=True)

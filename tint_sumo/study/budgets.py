@@ -20,6 +20,7 @@ from tint_sumo.config import (
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import Range, require_distinct, require_ranges, set_floats
 from tint_sumo.core.structures import Many
+from tint_sumo.methods.registry import METHODS
 
 
 @dataclass(frozen=True)
@@ -109,18 +110,6 @@ class Budget:
             )
 
 
-_TRAINED = (
-    "no_labels",
-    "morton",
-    "vae",
-    "no_attention",
-    "cross_window",
-    "streaming",
-    "streaming_critic",
-    "ma",
-    "oracle",
-)
-
 BUDGETS = {
     "quick": Budget(
         windows=30_000,
@@ -133,7 +122,7 @@ BUDGETS = {
     "full": Budget(
         traits=None,
         ppo=PPO_BUDGETS["full"],
-        methods=("always_go", "ttc", *_TRAINED),
+        methods=tuple(METHODS),
         seeds=(0, 1, 2, 3),
         trials=(
             Trials(tuple(Conditions(Mix(p)) for p in (0.1, 0.25, 0.4, 0.6, 0.9)), 1000),

@@ -22,6 +22,7 @@ from tint_sumo.dataset.windows import (
     split_by_episode,
     window_file,
 )
+from tint_sumo.scenes.drivers import require_two_kinds
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
 from tint_sumo.traits.figures import plot_latents, plot_reconstructions
 from tint_sumo.traits.model import find_trait_method
@@ -161,11 +162,7 @@ def _load_for_test(
 def first_of_two(labels: NDArray[np.int64], method: str) -> NDArray[np.bool_]:
     """Return which drivers are of the first of two kinds: conservative, or of the first vType."""
     kinds = np.unique(labels)
-    if len(kinds) != 2:
-        raise InputError(
-            f"method {method} learns two kinds of drivers, and these windows have {len(kinds)}; "
-            "choose a method without labels"
-        )
+    require_two_kinds(len(kinds), method, "the dataset")
     return np.asarray(labels == kinds[0])
 
 

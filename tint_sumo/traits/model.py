@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from tint_sumo.config import LATENT_SIZE, TraitSettings
-from tint_sumo.core.errors import find_named, refuse_old_name
+from tint_sumo.core.errors import find_named
 from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import WindowEncoder
 
@@ -151,5 +151,4 @@ def find_trait_method(name: Any) -> type[TraitModel]:
     Raises:
         InputError: there is none.
     """
-    refuse_old_name(name)
     return find_named("trait method", name, dict(sorted(TRAIT_METHODS.items())))

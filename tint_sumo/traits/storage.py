@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from tint_sumo.config import LatentCount, TraitSettings
 from tint_sumo.core.determinism import preserved_random_state
-from tint_sumo.core.errors import InputError, refuse_old_name
+from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_json, shipped, write_json
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import FieldError, build
@@ -113,7 +113,6 @@ def find(name_or_path: str | Path) -> Path:
     for stem in (shipped("models") / given, given / RUN_MODEL, weights):
         if stem.name and _weights_file(stem).is_file():
             return stem
-    refuse_old_name(name_or_path)
     known = sorted(file.stem for file in shipped("models").glob("*.safetensors") if _is_trait_model(file))
     raise InputError(
         f"no trait model {name_or_path}; give the folder of a training run, a .safetensors file, "

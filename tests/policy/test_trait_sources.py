@@ -305,9 +305,7 @@ def test_streaming_forgets_a_vehicle_that_has_left() -> None:
 
 @pytest.mark.parametrize("method", ["vae", "morton", "classifier"])
 def test_streaming_needs_posteriors(method: str) -> None:
-    with pytest.raises(
-        InputError, match=f"of a cross_window model, not of {method}; give a trait model of"
-    ):
+    with pytest.raises(InputError, match=f"of a cross_window model, not of {method}; give a trait model of"):
         StreamingTraits(load(method))
 
 

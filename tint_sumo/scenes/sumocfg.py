@@ -118,8 +118,10 @@ class SumocfgScene:
         Raises:
             InputError: either is given, but the vTypes and the demand of the configuration say who drives.
         """
-        if p_conservative is not None or tau_s is not None:
-            raise InputError("the demand of a .sumocfg says who drives how; leave p_conservative and tau_s out")
+        given = {"p_conservative": p_conservative, "tau_s": tau_s}
+        names = [name for name, value in given.items() if value is not None]
+        if names:
+            raise InputError(f"the demand of a .sumocfg says who drives how; leave {' and '.join(names)} out")
         return self
 
     @property

@@ -24,7 +24,8 @@ P_CONSERVATIVE = (0.25, 0.4, 0.6)  # driver mixes of the paper's experiments (pa
 
 SNAPSHOTS_PERCENT = (25, 50)  # parts of a training after which the policy is kept, too
 
-MOST_PROFILES = 127  # labels are numbers of one byte
+MOST_LABELS = 127  # labels are numbers of one byte
+MOST_ACTIONS = 100  # so are actions
 MOST_VTYPES = 10_000  # in a simulation
 MOST_DECISIONS = 2**22  # of a batch of PPO
 
@@ -137,8 +138,8 @@ class Population:
 
     def __post_init__(self) -> None:
         names = [profile.name for profile in self.profiles]
-        if not 1 <= len(names) <= MOST_PROFILES:
-            raise InputError(f"profiles must be 1 to {MOST_PROFILES}, not {len(names)}")
+        if not 1 <= len(names) <= MOST_LABELS:
+            raise InputError(f"profiles must be 1 to {MOST_LABELS}, not {len(names)}")
         if len(set(names)) < len(names):
             raise InputError(f"profiles must have names of their own, not {', '.join(names)}")
         require_ranges(self)
@@ -268,7 +269,11 @@ class Traffic:
 class EgoController:
     """The ego's low-level control (code): a PD law on speed, and a safety check that overrides it."""
 
-    desired_speeds_mps: Annotated[Many[SpeedMps], Length(2, 100)] = (0.0, 0.5, 3.0)  # the actions (paper III-C)
+    desired_speeds_mps: Annotated[Many[SpeedMps], Length(2, MOST_ACTIONS)] = (
+        0.0,
+        0.5,
+        3.0,
+    )  # the actions (paper III-C)
     gain_per_s: GainPerS = 2.0
     accel_limit_mps2: AccelMps2 = 3.0
     unsafe_distance_m: DistanceM = 0.8  # distance between vehicle boxes

@@ -205,10 +205,10 @@ def test_a_reset_without_options_may_say_so(env: SceneEnv, vector: SceneVectorEn
 
 @pytest.mark.parametrize("count", [0, -1, 2.0, True, None, "2", 10**9, np.float64(2)])
 def test_refused_numbers_of_environments(count: Any) -> None:
-    with pytest.raises(InputError, match=r"^num_envs must be 1 to 100000, not"):
+    with pytest.raises(InputError, match=r"^num_envs must (be an integer|lie in 1 to 100,000), not"):
         SceneVectorEnv(count)
     if count is not None:
-        with pytest.raises(InputError, match=r"^workers must be 1 to num_envs = 2, not"):
+        with pytest.raises(InputError, match=r"^workers must (be an integer|lie in 1 to 2), not"):
             SceneVectorEnv(2, workers=count)
 
 

@@ -101,5 +101,5 @@ def test_environments_of_several_scenes_are_those_of_each_scene() -> None:
 def test_several_scenes_need_as_many_workers() -> None:
     with pytest.raises(InputError, match="2 scenes need as many workers, not 3; leave workers out"):
         SceneVectorEnv(6, ["four_way", "roundabout"], workers=3)
-    with pytest.raises(InputError, match="workers must be 1 to num_envs = 1, not 2"):
+    with pytest.raises(InputError, match="the number of scenes must lie in 1 to 1, not 2"):
         SceneVectorEnv(1, ["four_way", "roundabout"])

@@ -187,3 +187,45 @@ def test_there_is_nothing_to_come_back_to_before_the_first_reset() -> None:
         vector.reset(seed=0)
         with pytest.raises(InputError, match="1 snapshots do not fit 2 environments"):
             vector.restore(vector.snapshot()[:1])
+
+
+OTHERS: tuple[dict[str, Any], ...] = (
+    {"scene": "four_way"},
+    {"p_conservative": 0.5},
+    {"time_limit_s": 20.0},
+    {"tau_s": 1.5},
+    {"position_noise_m": 0.1},
+    {"decision_s": 0.2},
+)
+
+
+@pytest.mark.parametrize("task", OTHERS, ids=lambda task: next(iter(task)))
+def test_a_snapshot_of_other_settings_is_refused(task: dict[str, Any]) -> None:
+    with closing(SceneEnv()) as env, closing(SceneVectorEnv(2)) as vector:
+        env.reset(seed=0), vector.reset(seed=0)
+        snapshot, snapshots = env.snapshot(), vector.snapshot()
+    with (
+        closing(SceneEnv(**task)) as env,
+        pytest.raises(InputError, match="^the snapshot is of another scene or other"),
+    ):
+        env.restore(snapshot)
+    with closing(SceneVectorEnv(2, **task)) as vector, pytest.raises(InputError, match="is of another scene or other"):
+        vector.restore(snapshots)
+
+
+def test_settings_that_leave_an_episode_as_it_is_may_differ() -> None:
+    with closing(SceneEnv(reward="authors", tracks=True)) as env:
+        env.reset(seed=0)
+        env.step(np.int64(2))
+        snapshot = env.snapshot()
+    with closing(SceneVectorEnv(1)) as vector:
+        assert vector.restore([snapshot])[1]["time_s"].tolist() == [0.1]
+
+
+def test_each_environment_of_a_vector_has_the_snapshots_of_its_scene() -> None:
+    with closing(SceneVectorEnv(2, scene=["four_way", T_INTERSECTION])) as vector:
+        vector.reset(seed=0)
+        first, second = vector.snapshot()
+        with pytest.raises(InputError, match="is of another scene or other settings"):
+            vector.restore([second, first])
+        vector.restore([first, second])

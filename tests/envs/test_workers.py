@@ -177,7 +177,7 @@ def test_this_process_takes_part_unless_its_libsumo_is_taken() -> None:
 
 @pytest.mark.parametrize("workers", [0, 3])
 def test_the_number_of_workers_must_fit(workers: int) -> None:
-    with pytest.raises(InputError, match=f"workers must be 1 to num_envs = 2, not {workers}"):
+    with pytest.raises(InputError, match=f"workers must lie in 1 to 2, not {workers}"):
         SceneVectorEnv(2, workers=workers)
 
 

@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 
 from tests.scenes.networks import USER_NETWORKS, UserNetwork, write_config
+from tint_sumo.config import MOST_LABELS
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SumocfgScene
 from tint_sumo.scenes.network import sumo_program
-from tint_sumo.scenes.sumocfg import MOST_VTYPES, NET_VERSION, read_config, read_net, read_vtypes
+from tint_sumo.scenes.sumocfg import NET_VERSION, read_config, read_net, read_vtypes
 
 Make = Callable[[str], UserNetwork]
 
@@ -122,7 +123,7 @@ def test_the_known_version_is_that_of_this_sumo(tmp_path: Path) -> None:
 
 
 def test_too_many_vtypes_are_refused(merge: UserNetwork) -> None:
-    lines = "".join(f'<vType id="{number}"/>' for number in range(MOST_VTYPES + 1))
+    lines = "".join(f'<vType id="{number}"/>' for number in range(MOST_LABELS + 1))
     (merge.sumocfg.parent / "merge.rou.xml").write_text(f"<routes>{lines}</routes>")
     with pytest.raises(InputError, match="128 vTypes; at most 127"):
         read_vtypes(read_config(merge.sumocfg))

@@ -35,8 +35,8 @@ def find_named(kind: str, name: str, known: Mapping[str, T]) -> T:
 
 
 def shown(value: object) -> str:
-    """Return a value as Python writes it, cut to what fits into a message."""
-    return _SHOWN.repr(value)
+    """Return a value as Python writes it, in one line and cut to what fits into a message."""
+    return " ".join(_SHOWN.repr(value).split())
 
 
 class JobError(RuntimeError):

@@ -16,6 +16,8 @@ from tint_sumo.envs.rendering import render_scene
 from tint_sumo.envs.rows import Rows, outcome_name
 from tint_sumo.simulation.timing import StepPart, does
 
+_ACTION = np.int8  # has room for MOST_ACTIONS
+
 
 @dataclass(frozen=True)
 class Ended:
@@ -32,22 +34,25 @@ class Ended:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """How an episode has come to where it is: it follows from its seed and the actions so far."""
+    """Generator state and actions that replay an episode to this step."""
 
-    began: dict[str, Any]  # state of the environment's generator that the seed was drawn from
+    began: dict[str, Any]  # state of the environment's generator when the episode's seed was drawn
     actions: tuple[int, ...]
+    task: str  # fingerprint of the environment's settings
 
 
-def checked_snapshots(snapshots: Any, num_envs: int) -> list[Snapshot]:
-    """Return the snapshots.
+def checked_snapshots(snapshots: Any, tasks: Sequence[str]) -> list[Snapshot]:
+    """Return the snapshots, for environments of these fingerprints.
 
     Raises:
-        InputError: they are no sequence of snapshots, one for each environment.
+        InputError: they are no sequence of snapshots, one for each environment, or of other settings.
     """
     if not isinstance(snapshots, Sequence) or not all(isinstance(one, Snapshot) for one in snapshots):
         raise InputError(f"what snapshot() has returned can be restored, not {shown(snapshots)}")
-    if len(snapshots) != num_envs:
-        raise InputError(f"{len(snapshots)} snapshots do not fit {num_envs} environments; give as many")
+    if len(snapshots) != len(tasks):
+        raise InputError(f"{len(snapshots)} snapshots do not fit {len(tasks)} environments; give as many")
+    if [one.task for one in snapshots] != list(tasks):
+        raise InputError("the snapshot is of another scene or other settings; make this environment as that one")
     return list(snapshots)
 
 
@@ -92,7 +97,7 @@ class LocalBatch:
         self.rows = self.episodes.rows
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._began: list[dict[str, Any]] = [{}] * num_envs  # states of the generators when the episodes began
-        self._steps_per_decision = settings.steps_per_decision
+        self._settings = settings
         # The actions of the last decisions, (N,) each.
         self._actions: deque[NDArray[np.integer]] = deque(maxlen=settings.decisions_per_episode + 1)
 
@@ -110,7 +115,7 @@ class LocalBatch:
 
     @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> list[Ended]:
-        self._actions.append(actions.astype(np.int8))
+        self._actions.append(actions.astype(_ACTION))
         due = self._over() if self._autoreset_mode is AutoresetMode.NEXT_STEP else []
         any_ended = len(due) < len(self.rows) and self.episodes.step(actions)
         for index in due:
@@ -133,11 +138,13 @@ class LocalBatch:
             self.episodes.park(index)
 
     def snapshot(self) -> list[Snapshot]:
-        taken = np.array(self._actions, np.int8).reshape(-1, len(self._began))
-        decisions = -(-self.episodes.steps // self._steps_per_decision)  # the last one may have been cut short
+        taken = np.array(self._actions, _ACTION).reshape(-1, len(self._began))
+        # The last decision may have been cut short.
+        decisions = -(-self.episodes.steps // self._settings.steps_per_decision)
         first = len(taken) - decisions  # of the present episodes
         return [
-            Snapshot(began, tuple(taken[first[index] :, index].tolist())) for index, began in enumerate(self._began)
+            Snapshot(began, tuple(taken[first[index] :, index].tolist()), self._settings.fingerprint)
+            for index, began in enumerate(self._began)
         ]
 
     def restore(self, snapshots: Sequence[Snapshot]) -> None:
@@ -152,7 +159,7 @@ class LocalBatch:
                     self._begin(index)
             if left:
                 actions = [one.actions[-left] if left <= len(one.actions) else 0 for one in snapshots]
-                self._actions.append(np.array(actions, np.int8))
+                self._actions.append(np.array(actions, _ACTION))
                 self.episodes.step(self._actions[-1])
 
     def _ended(self, index: int) -> Ended:

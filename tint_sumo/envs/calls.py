@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.core.errors import InputError
-
-_SHOWN = 80  # characters of a value that is refused
+from tint_sumo.core.errors import InputError, shown
+from tint_sumo.core.ranges import Range
 
 
 class Phase(Enum):
@@ -22,27 +21,43 @@ class Phase(Enum):
     CLOSED = "the environment is closed; make a new one"
 
 
-def require_open(phase: Phase) -> None:
-    """Raise InputError after ``close()``."""
-    if phase is Phase.CLOSED:
-        raise InputError(phase.value)
+class Calls:
+    """The phase of an environment. ``with calls:`` stands around work that leaves an episode to go on with.
+
+    If it fails or is interrupted, the environment must be reset first.
+    """
+
+    def __init__(self) -> None:
+        self.phase = Phase.NEW
+
+    def __enter__(self) -> None:
+        self.phase = Phase.BUSY
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.phase = Phase.READY
+
+    def require_open(self) -> None:
+        """Raise InputError after ``close()``."""
+        if self.phase is Phase.CLOSED:
+            raise InputError(self.phase.value)
+
+    def require_episode(self) -> None:
+        """Raise InputError where there is no episode to go on with."""
+        if self.phase is not Phase.READY:
+            raise InputError(self.phase.value)
 
 
-def require_episode(phase: Phase) -> None:
-    """Raise InputError where there is no episode to go on with."""
-    if phase is not Phase.READY:
-        raise InputError(phase.value)
-
-
-def checked_count(name: str, value: Any, low: int, high: int, limit: str = "") -> int:
-    """Return a number of things as Python's integer; ``limit`` names the highest one in the message.
+def checked_count(name: str, value: Any, most: int) -> int:
+    """Return a number of things as Python's integer.
 
     Raises:
-        InputError: it is no integer from ``low`` to ``high``.
+        InputError: it is no integer from 1 to ``most``.
     """
     number = _integer(value)
-    if number is None or not low <= number <= high:
-        raise InputError(f"{name} must be {low} to {limit}{high}, not {_shown(value)}")
+    if number is None:
+        raise InputError(f"{name} must be an integer, not {shown(value)}")
+    Range(1, most).require(name, number)
     return number
 
 
@@ -63,7 +78,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...], choices: int) -> NDArr
     ):
         allowed = ", ".join(map(str, range(choices)))
         wanted = f"actions must be {shape[0]} of {allowed}" if shape else f"an action must be one of {allowed}"
-        raise InputError(f"{wanted}, not {_shown(actions)}")
+        raise InputError(f"{wanted}, not {shown(actions)}")
     return array
 
 
@@ -77,7 +92,7 @@ def checked_seed(seed: Any) -> int | None:
         return None
     number = _integer(seed)
     if number is None or number < 0:
-        raise InputError(f"a seed must be an integer of at least 0, not {_shown(seed)}")
+        raise InputError(f"a seed must be an integer of at least 0, not {shown(seed)}")
     return number
 
 
@@ -105,10 +120,10 @@ def checked_options(options: Any, known: tuple[str, ...] = ()) -> Mapping[str, A
     """
     allowed = f"known are: {', '.join(known)}" if known else "this environment knows none"
     if options is not None and not isinstance(options, Mapping):
-        raise InputError(f"options must be a dictionary or None, not {_shown(options)}; {allowed}")
+        raise InputError(f"options must be a dictionary or None, not {shown(options)}; {allowed}")
     unknown = [name for name in options or () if name not in known]
     if unknown:
-        raise InputError(f"there is no reset option {_shown(unknown[0])}; {allowed}")
+        raise InputError(f"there is no reset option {shown(unknown[0])}; {allowed}")
     return options or {}
 
 
@@ -124,7 +139,7 @@ def checked_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:
     if array.dtype.kind != "b" or array.shape != (num_envs,) or not array.any():
         raise InputError(
             f"reset_mask must be {num_envs} booleans, one for each environment, at least one of them true; "
-            f"not {_shown(mask)}"
+            f"not {shown(mask)}"
         )
     return array
 
@@ -143,9 +158,3 @@ def _as_array(value: Any) -> NDArray[Any]:
         return np.asarray(value)
     except (TypeError, ValueError, RuntimeError):
         return np.array(None)
-
-
-def _shown(value: Any) -> str:
-    """Return a value for a message: in one line, and not all of it if it is long."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."

@@ -1,5 +1,6 @@
 """Episodes of the navigation task in a batch of intersections: what all environment classes share."""
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -102,6 +103,12 @@ class TaskSettings:
     def decisions_per_episode(self) -> int:
         """Most decisions in an episode."""
         return math.ceil(round(self.played.time_limit_s / self._step_s) / self.steps_per_decision)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Digest of all settings on which the course of an episode depends; 16 hexadecimal digits."""
+        text = repr((self.played, self.position_noise_m, self.steps_per_decision))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
     def slot_infos(self) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """The single environment."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -11,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Snapshot, checked_snapshots
-from tint_sumo.envs.calls import Phase, checked_actions, checked_options, checked_seed, require_episode, require_open
+from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_options, checked_seed
 from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_arguments
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, Observation, fields_of, start_info, step_info
@@ -140,7 +141,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self.action_space: gymnasium.spaces.Discrete = action_space(settings.played)
         self._slot_infos = settings.slot_infos
         self._settings = settings
-        self._phase = Phase.NEW
+        self._calls = Calls()
         self._episodes = Episodes(1, settings)
         self._began: dict[str, Any] = {}
         self._actions: list[int] = []
@@ -163,7 +164,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         Raises:
             InputError: the seed is none, or options are given.
         """
-        require_open(self._phase)
+        self._calls.require_open()
         checked_options(options)
         super().reset(seed=checked_seed(seed))
         self._play(())
@@ -173,7 +174,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     @cached_property
     def _episodes(self) -> Episodes:
         """The running simulation; started when it is needed in a copy, or after a call that was interrupted."""
-        require_open(self._phase)
+        self._calls.require_open()
         return Episodes(1, self._settings)
 
     def _stop(self) -> None:
@@ -184,22 +185,20 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     def _play(self, actions: Sequence[int]) -> None:
         """Begin an episode drawn from the generator, and take these actions in it."""
-        if self._phase is Phase.BUSY:  # an interrupted call may have been done in part
+        if self._calls.phase is Phase.BUSY:  # an interrupted call may have been done in part
             self._stop()
-        self._phase = Phase.BUSY
-        self._began = dict(self.np_random.bit_generator.state)
-        self._actions = []
-        self._episodes.begin(0, self.np_random)
-        for action in actions:
-            self._step(np.array([action]))
-        self._phase = Phase.READY
+        with self._calls:
+            self._began = dict(self.np_random.bit_generator.state)
+            self._actions = []
+            self._episodes.begin(0, self.np_random)
+            for action in actions:
+                self._step(np.array([action]))
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        require_episode(self._phase)
+        self._calls.require_episode()
         actions = checked_actions(action, (), int(self.action_space.n)).reshape(1)
-        self._phase = Phase.BUSY
-        self._step(actions)
-        self._phase = Phase.READY
+        with self._calls:
+            self._step(actions)
         self._show()
         fields = fields_of(self._episodes.rows)
         info = step_info(fields, self._slot_infos, self._episodes.collision_info(0))
@@ -220,8 +219,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         Raises:
             InputError: no episode has begun.
         """
-        require_episode(self._phase)
-        return Snapshot(self._began, tuple(self._actions))
+        self._calls.require_episode()
+        return Snapshot(self._began, tuple(self._actions), self._settings.fingerprint)
 
     def restore(self, snapshot: Snapshot) -> tuple[Observation, dict[str, Any]]:
         """Go back, or to another environment's episode with the same arguments; the observation and info there.
@@ -230,10 +229,10 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         hold all that its vehicles remember, and would not go on to the last bit as the episode did.
 
         Raises:
-            InputError: it is no snapshot.
+            InputError: it is no snapshot, or one of another scene or other settings.
         """
-        require_open(self._phase)
-        (snapshot,) = checked_snapshots([snapshot], 1)
+        self._calls.require_open()
+        (snapshot,) = checked_snapshots([snapshot], [self._settings.fingerprint])
         self.np_random.bit_generator.state = snapshot.began
         self._play(snapshot.actions)
         self._show()
@@ -249,7 +248,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
         None with ``render_mode="human"``, where the window follows by itself.
         """
-        require_episode(self._phase)
+        self._calls.require_episode()
         return render_scene(self._episodes.simulation, 0) if self.render_mode == "rgb_array" else None
 
     def _show(self) -> None:
@@ -258,7 +257,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     def close(self) -> None:
         """End the simulation; safe to call twice. Everything else is refused from then on."""
-        self._phase = Phase.CLOSED
+        self._calls.phase = Phase.CLOSED
         if self._window:
             self._window.close()
         self._stop()
@@ -273,12 +272,13 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         Libsumo may be in use by the original; then the copy goes through TraCI.
         """
         vars(self).update(state)
+        self._calls = copy(self._calls)
         self._window = None
         if self.render_mode == "human":
             self.render_mode = None
         if self._settings.backend == "libsumo":
             self._settings = replace(self._settings, backend="auto")
-        if self._phase is Phase.READY:
+        if self._calls.phase is Phase.READY:
             drawn = self.np_random.bit_generator.state
             self.restore(self.snapshot())
             self.np_random.bit_generator.state = drawn  # also what the user has drawn from it since the reset

@@ -1,6 +1,7 @@
 """The vector environment: all environments are replicas of a scene in one simulation."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -14,14 +15,13 @@ from numpy.typing import NDArray
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs.batch import Batch, Ended, LocalBatch, Snapshot, checked_snapshots
 from tint_sumo.envs.calls import (
+    Calls,
     Phase,
     checked_actions,
     checked_count,
     checked_mask,
     checked_options,
     checked_seeds,
-    require_episode,
-    require_open,
 )
 from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space, require_arguments
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
@@ -36,7 +36,7 @@ from tint_sumo.envs.rows import (
     outcome_names,
     step_info,
 )
-from tint_sumo.envs.workers import WorkerBatch
+from tint_sumo.envs.workers import WorkerBatch, shares_of
 from tint_sumo.scenes import T_INTERSECTION, AnyScene
 
 MOST_ENVS = 100_000  # environments of one vector: beyond, memory would run out before anything is said
@@ -79,16 +79,15 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **task: Any,
     ) -> None:
-        num_envs = checked_count("num_envs", num_envs, 1, MOST_ENVS)
+        num_envs = checked_count("num_envs", num_envs, MOST_ENVS)
         if isinstance(scene, str) or not isinstance(scene, Sequence):
-            count = 1 if workers is None else checked_count("workers", workers, 1, num_envs, "num_envs = ")
+            count = 1 if workers is None else checked_count("workers", workers, num_envs)
             scenes: Sequence[AnyScene] = [scene] * count
         elif workers in (None, len(scene)):
             scenes = scene
         else:
             raise InputError(f"{len(scene)} scenes need as many workers, not {workers}; leave workers out")
-        if not 1 <= len(scenes) <= num_envs:
-            raise InputError(f"workers must be 1 to num_envs = {num_envs}, not {len(scenes)}")
+        checked_count("the number of scenes", len(scenes), num_envs)
         require_render_mode(render_mode, self.metadata["render_modes"])
         require_arguments(SceneVectorEnv, task)
         all_settings = [TaskSettings(one, **task) for one in scenes]
@@ -106,7 +105,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._settings = all_settings
-        self._phase = Phase.NEW
+        self._calls = Calls()
         self.batch = self._make_batch()
 
     def _make_batch(self) -> Batch:
@@ -118,7 +117,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     @cached_property
     def batch(self) -> Batch:
         """The running environments; started when they are needed in a copy, or after a call that was interrupted."""
-        require_open(self._phase)
+        self._calls.require_open()
         return self._make_batch()
 
     def _stop(self) -> None:
@@ -136,22 +135,21 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             InputError: a seed, an option or the mask does not fit; or the mask leaves out environments that have no
                 episode yet, or whose last call has failed or was interrupted.
         """
-        require_open(self._phase)
+        self._calls.require_open()
         seeds = checked_seeds(seed, self.num_envs)
         mask = checked_mask(checked_options(options, ("reset_mask",)).get("reset_mask"), self.num_envs)
         if not mask.all():
-            require_episode(self._phase)
-        if self._phase is Phase.BUSY:  # an interrupted call may have been done in part
+            self._calls.require_episode()
+        if self._calls.phase is Phase.BUSY:  # an interrupted call may have been done in part
             self._stop()
-        self._phase = Phase.BUSY
-        self.batch.reset(seeds, mask)
-        self._phase = Phase.READY
+        with self._calls:
+            self.batch.reset(seeds, mask)
         return self._shown(mask)
 
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        require_episode(self._phase)
+        self._calls.require_episode()
         begun = self.batch.rows["outcome"] != GOING_ON  # those that ended before: NEXT_STEP now begins the next ones
         if self._mode is AutoresetMode.DISABLED and begun.any():
             raise InputError(
@@ -173,16 +171,25 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
         Rewards, terminations and truncations are those of the step, all else is as it is now.
         """
-        require_episode(self._phase)
+        self._calls.require_episode()
         taken = checked_actions(actions, (self.num_envs,), int(self.single_action_space.n))
-        self._phase = Phase.BUSY
-        ended = self.batch.step(taken)
-        self._phase = Phase.READY
+        with self._calls:
+            ended = self.batch.step(taken)
         rows = copied(self.batch.rows)
         for one in ended:
             for key in ("reward", "terminated", "truncated"):
                 rows[key][one.index] = one.row[key]
         return rows, ended
+
+    @property
+    def tasks(self) -> list[str]:
+        """Fingerprint of each environment's settings, which its snapshots have, too."""
+        shares = shares_of(self.num_envs, len(self._settings))
+        return [
+            one.fingerprint
+            for one, share in zip(self._settings, shares, strict=True)
+            for _ in range(share.start, share.stop)
+        ]
 
     def snapshot(self) -> list[Snapshot]:
         """What ``restore`` needs to come back to where the episodes are now, as in ``SceneEnv``; it can be pickled.
@@ -190,11 +197,9 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         Raises:
             InputError: no episodes have begun.
         """
-        require_episode(self._phase)
-        self._phase = Phase.BUSY
-        snapshots = self.batch.snapshot()
-        self._phase = Phase.READY
-        return snapshots
+        self._calls.require_episode()
+        with self._calls:
+            return self.batch.snapshot()
 
     def restore(self, snapshots: Sequence[Snapshot]) -> tuple[Observation, dict[str, Any]]:
         """Go back, or to the episodes of another vector with the same arguments; the observation and infos there.
@@ -202,23 +207,21 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         It takes as long as the longest episode so far.
 
         Raises:
-            InputError: they are no snapshots, or not as many as environments.
+            InputError: they are no snapshots, not as many as environments, or of other settings.
         """
-        require_open(self._phase)
-        checked = checked_snapshots(snapshots, self.num_envs)
-        if self._phase is Phase.BUSY:
+        self._calls.require_open()
+        checked = checked_snapshots(snapshots, self.tasks)
+        if self._calls.phase is Phase.BUSY:
             self._stop()
-        self._phase = Phase.BUSY
-        self.batch.restore(checked)
-        self._phase = Phase.READY
+        with self._calls:
+            self.batch.restore(checked)
         return self._shown()
 
     def park(self, mask: NDArray[np.bool_]) -> None:
         """Empty the environments where the mask (N,) is true: they cost next to nothing until their next reset."""
-        require_episode(self._phase)
-        self._phase = Phase.BUSY
-        self.batch.park(mask)
-        self._phase = Phase.READY
+        self._calls.require_episode()
+        with self._calls:
+            self.batch.park(mask)
 
     def _shown(self, mask: NDArray[np.bool_] | None = None) -> tuple[Observation, dict[str, Any]]:
         """The observation where the environments are, and the infos of those in the mask, by default of all."""
@@ -244,27 +247,26 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One (H, W, 3) image per environment."""
-        require_episode(self._phase)
+        self._calls.require_episode()
         if self.render_mode is None:
             return None
-        self._phase = Phase.BUSY
-        images = tuple(self.batch.render())
-        self._phase = Phase.READY
-        return images
+        with self._calls:
+            return tuple(self.batch.render())
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002 - gymnasium's signature
-        self._phase = Phase.CLOSED
+        self._calls.phase = Phase.CLOSED
         self._stop()
 
     def __getstate__(self) -> tuple[dict[str, Any], list[Snapshot]]:
         """Return what a copy or a pickle consists of: everything but the simulations, and where the episodes are."""
         attributes = {name: value for name, value in vars(self).items() if name != "batch"}
-        return attributes, self.snapshot() if self._phase is Phase.READY else []
+        return attributes, self.snapshot() if self._calls.phase is Phase.READY else []
 
     def __setstate__(self, state: tuple[dict[str, Any], list[Snapshot]]) -> None:
         """Restore a copy from its state, as in ``SceneEnv``."""
         attributes, snapshots = state
         vars(self).update(attributes)
+        self._calls = copy(self._calls)
         self._settings = [replace(one, backend="auto") if one.backend == "libsumo" else one for one in self._settings]
         if snapshots:
             self.restore(snapshots)

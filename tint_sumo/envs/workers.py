@@ -32,6 +32,11 @@ _LOOK_OUT_S = 1e-3  # about the time of a step; sleeping and waking up would cos
 _INTEGER = np.dtype(np.int64)
 
 
+def shares_of(num_envs: int, workers: int) -> list[slice]:
+    """Return which environments are in which process: in order, and as evenly as can be."""
+    return [slice(*share) for share in pairwise(num_envs * worker // workers for worker in range(workers + 1))]
+
+
 class WorkerBatch:
     """``num_envs`` environments shared out among processes, in order and as evenly as can be; each has its settings.
 
@@ -43,8 +48,7 @@ class WorkerBatch:
     def __init__(self, num_envs: int, settings: Sequence[TaskSettings], autoreset_mode: AutoresetMode) -> None:
         workers = len(settings)
         shared = _Shared(num_envs, workers, settings[0].played.max_vehicles)
-        bounds = [num_envs * worker // workers for worker in range(workers + 1)]
-        self._shares = [slice(*share) for share in pairwise(bounds)]
+        self._shares = shares_of(num_envs, workers)
         self.rows = shared.rows
         self._local: LocalBatch | None = None
         self._helpers: list[_Helper] = []

@@ -170,8 +170,8 @@ def _episodes(venv: VecEnv, tensors: Tensors, state: _State) -> list[Snapshot]:
         raise ValueError(f"it is of {len(counts)} environments, not of {venv.num_envs}")
     if min(counts) < 0 or sum(counts) != len(actions) or not set(actions) <= set(range(int(venv.action_space.n))):
         raise ValueError("the actions of its episodes do not fit")
-    ends = np.cumsum(counts).tolist()
+    ends, (tasks,) = np.cumsum(counts).tolist(), venv.get_attr("tasks", 0)
     return [
-        Snapshot(began.to_numpy(), tuple(actions[end - count : end]))
-        for began, count, end in zip(state.began, counts, ends, strict=True)
+        Snapshot(began.to_numpy(), tuple(actions[end - count : end]), task)
+        for began, count, end, task in zip(state.began, counts, ends, tasks, strict=True)
     ]

@@ -18,8 +18,9 @@ from xml.sax import SAXException
 
 import shapely
 import sumolib
+from sumolib.miscutils import parseTime
 
-from tint_sumo.config import DistanceM, EgoController, Slots, TimeS, VehicleShape, WarmUpS
+from tint_sumo.config import MOST_LABELS, DistanceM, EgoController, Slots, TimeS, VehicleShape, WarmUpS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import require_ranges
 from tint_sumo.core.reading import TABLE_BYTES, require_file
@@ -27,7 +28,6 @@ from tint_sumo.scenes.roads import Roads, paved_areas
 from tint_sumo.scenes.scene import EgoTask
 
 NET_VERSION = (1, 20)  # the version that this SUMO's netconvert writes into networks
-MOST_VTYPES = 127  # labels are numbers of one byte
 DEFAULT_VTYPE = "DEFAULT_VEHTYPE"  # SUMO's type for vehicles that name none
 _EGO_CLASS = "passenger"
 _COLOURS = ((40, 90, 200), (200, 40, 40), (30, 140, 70), (130, 60, 170), (220, 110, 20), (20, 150, 170), (90, 90, 90))
@@ -241,9 +241,7 @@ def _files(config: Path, options: dict[str, str], names: tuple[str, ...]) -> lis
 def _seconds(text: str, file: Path) -> float:
     """A time of SUMO's, in seconds or as hours:minutes:seconds."""
     try:
-        step_s = 0.0
-        for part in text.split(":"):
-            step_s = step_s * 60.0 + float(part)
+        step_s = float(parseTime(text) or math.nan)
     except ValueError:
         step_s = math.nan
     if not 0.001 <= step_s <= 10.0:  # SUMO's shortest
@@ -285,8 +283,8 @@ def read_vtypes(config: SumoConfig) -> tuple[str, ...]:
             elif element.tag in ("vehicle", "trip", "flow"):
                 used.add(element.get("type", DEFAULT_VTYPE))
     found = tuple(sorted(defined | (used - distributions)))
-    if len(found) > MOST_VTYPES:
-        raise InputError(f"{config.file} has {len(found)} vTypes; at most {MOST_VTYPES} can be told apart: use fewer")
+    if len(found) > MOST_LABELS:
+        raise InputError(f"{config.file} has {len(found)} vTypes; at most {MOST_LABELS} can be told apart: use fewer")
     return found
 
 
@@ -341,20 +339,11 @@ def _measured(net: Any, edges: tuple[str, ...]) -> tuple[tuple[float, ...], list
 def _junction_m(net: Any, edge: str, after: str) -> float:
     """Length of the shortest way over the junction between two edges."""
     ways = [
-        _internal_m(net, way.getViaLaneID())
+        way
         for way in net.getEdge(edge).getOutgoing().get(net.getEdge(after), [])
         if way.getFromLane().allows(_EGO_CLASS) and way.getToLane().allows(_EGO_CLASS)
     ]
     if not ways:
         raise InputError(f"ego_route: no way for passenger cars leads from edge {edge!r} to edge {after!r}")
-    return min(ways)
-
-
-def _internal_m(net: Any, via: str) -> float:
-    """Length of a lane on a junction and, where it has a place to wait in its middle, of the rest."""
-    length_m = 0.0
-    while via:
-        lane = net.getLane(via)
-        length_m += float(lane.getLength())
-        via = lane.getOutgoing()[0].getViaLaneID()
-    return length_m
+    path, length_m = net.getInternalPath(ways)
+    return float(length_m) if path else 0.0  # a network can lack its junctions' lanes

@@ -121,7 +121,7 @@ def test_stable_baselines_has_them_too(user_network: Make) -> None:
 
 @pytest.mark.parametrize("settings", [{"p_conservative": 0.5}, {"tau_s": 1.5}])
 def test_nobody_but_the_configuration_says_who_drives(settings: dict[str, float], user_network: Make) -> None:
-    with pytest.raises(InputError, match="leave (p_conservative|tau_s) out"):
+    with pytest.raises(InputError, match=r"leave (p_conservative|tau_s) out"):
         SceneEnv(user_network("merge").scene(), **settings)
 
 
@@ -206,7 +206,7 @@ def test_a_snapshot_of_other_settings_is_refused(task: dict[str, Any]) -> None:
         snapshot, snapshots = env.snapshot(), vector.snapshot()
     with (
         closing(SceneEnv(**task)) as env,
-        pytest.raises(InputError, match="^the snapshot is of another scene or other"),
+        pytest.raises(InputError, match="is of another scene or other"),
     ):
         env.restore(snapshot)
     with closing(SceneVectorEnv(2, **task)) as vector, pytest.raises(InputError, match="is of another scene or other"):

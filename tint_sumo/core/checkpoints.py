@@ -30,7 +30,7 @@ def pack(tensors: Mapping[str, Tensor], state: Any) -> bytes:
 
     Args:
         tensors: by name; they are copied.
-        state: a dataclass with whatever else the training goes on from.
+        state: a dataclass with all else that a resumed training needs.
     """
     whole = {name: tensor.detach().clone().contiguous() for name, tensor in tensors.items()}  # one may hold another
     return safetensors.torch.save(whole, {_STATE: json.dumps(plain(state))})
@@ -70,7 +70,7 @@ def read_checkpoint(out: Path, state: type[T]) -> tuple[Tensors, T] | None:
 
 @contextmanager
 def damage_reported(out: Path) -> Iterator[None]:
-    """Raise what a checkpoint that does not fit raises in the block as InputError."""
+    """Raise InputError for the exceptions of a checkpoint that does not fit."""
     try:
         yield
     except (SafetensorError, ValueError, LookupError, TypeError, RuntimeError) as error:
@@ -81,7 +81,7 @@ def damage_reported(out: Path) -> Iterator[None]:
 
 
 def training_tensors(model: nn.Module, optimizer: torch.optim.Optimizer) -> Tensors:
-    """Return the weights and buffers of a model, and what its optimizer remembers of each weight."""
+    """Return the weights and buffers of a model, and the state of its optimizer for each weight."""
     remembered = {
         f"{_OPTIMIZER}{name}.{key}": value
         for name, parameter in model.named_parameters()
@@ -95,7 +95,7 @@ def _weights(model: nn.Module) -> Tensors:
 
 
 def restore_training(model: nn.Module, optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Bring a model and its new optimizer to where others were whose ``training_tensors`` are among these.
+    """Give a model and its new optimizer the state of those whose ``training_tensors`` are among these.
 
     Raises:
         ValueError: a tensor is missing, has another shape or type, or a number that is not finite.
@@ -106,9 +106,9 @@ def restore_training(model: nn.Module, optimizer: torch.optim.Optimizer, tensors
     for number, (name, parameter) in enumerate(model.named_parameters()):
         like = {"step": torch.zeros(()), "exp_avg": parameter, "exp_avg_sq": parameter}  # of Adam
         named = {key: f"{_OPTIMIZER}{name}.{key}" for key in like}
-        if any(one in tensors for one in named.values()):  # else no step has changed it
-            state[number] = {key: torch.empty_like(one, requires_grad=False) for key, one in like.items()}
-            copy_into({named[key]: one for key, one in state[number].items()}, tensors)
+        if any(full_name in tensors for full_name in named.values()):  # else no step has changed it
+            state[number] = {key: torch.empty_like(tensor, requires_grad=False) for key, tensor in like.items()}
+            copy_into({named[key]: tensor for key, tensor in state[number].items()}, tensors)
             require_finite_tensors(state[number])
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 

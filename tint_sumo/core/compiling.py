@@ -1,4 +1,4 @@
-"""Functions of numbers and arrays compiled to machine code (Numba), for what is done in every step.
+"""Functions of numbers and arrays compiled to machine code (Numba), for the work of every step.
 
 A compiled function may use only functions and constants of its own file, and takes all else as arguments: Numba keeps
 the machine code beside that file and makes it anew when that file changes, and when no other does.

@@ -13,7 +13,7 @@ def preserved_random_state() -> Iterator[None]:
     """Give Python's, NumPy's and torch's global random generators their states back when the block ends.
 
     Stable-Baselines3 seeds all three, and every network that is built draws its first weights, even if they are
-    overwritten at once. What only looks at a training, or loads a network, does so in such a block.
+    overwritten at once. Code that only looks at a training, or loads a network, runs in such a block.
     """
     python, numpy, pytorch = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
     try:

@@ -1,4 +1,4 @@
-"""The one exception type for mistakes a user can mend, and the mistake of a name that nothing has."""
+"""Exceptions: mistakes that a user can mend, jobs that fail, and what the system refuses."""
 
 import errno
 import reprlib
@@ -24,10 +24,15 @@ class NotFiniteError(InputError):
 
 
 def find_named(kind: str, name: str, known: Mapping[str, T]) -> T:
-    """The one of the known things that has this name.
+    """Return the known thing of this name.
+
+    Args:
+        kind: of the things, for the message.
+        name: to look for.
+        known: all of them by name.
 
     Raises:
-        InputError: none has; ``kind`` says in the message what was looked for.
+        InputError: there is none of this name.
     """
     if name not in known:
         raise InputError(f"unknown {kind} {name!r}; choose one of: {', '.join(known)}")
@@ -40,11 +45,11 @@ def shown(value: object) -> str:
 
 
 class JobError(RuntimeError):
-    """Jobs were given up: which, and why, in one line. The command line exits with code 1 on it."""
+    """Jobs were given up: one line that names them and says why. The command line exits with code 1 on it."""
 
 
 class DivergedError(JobError):
-    """A training has met a number that is not finite: at which step, in one line. It ends there if it is repeated."""
+    """A training has met a number that is not finite: one line with the step, where it ends again if repeated."""
 
 
 BAD_PATHS = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError)  # another path mends these

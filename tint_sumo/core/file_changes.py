@@ -1,4 +1,4 @@
-"""Files of a folder on their way to another place, and what has changed among them."""
+"""Files that are copied from a folder elsewhere, and the changes among them."""
 
 import math
 import os
@@ -14,7 +14,7 @@ FileState = tuple[int, int]  # time of the last change in ns, size
 
 
 class Changes:
-    """What changes among some files of a folder, from now on.
+    """Changes among some files of a folder, from now on.
 
     Args:
         folder: it need not be there yet.
@@ -28,16 +28,16 @@ class Changes:
         self._known = dict(file_states(folder, paths))
 
     def take(self, before_s: float | None = None) -> dict[str, bytes | None]:
-        """Contents of the files that have changed since they were taken last, older files first; None: it is gone.
+        """Return the contents of files that have changed since they were taken last, older files first; None: gone.
 
-        While somebody writes there, ``before_s`` is the present time (since the epoch), and only files are taken that
+        While others write there, ``before_s`` is the present time (since the epoch), and only files are taken that
         have not changed for a moment before it: where a file is taken, so are those that were written before it.
         Without it everything is taken.
         """
         return dict(self.take_each(before_s))
 
     def take_each(self, before_s: float | None = None) -> Iterator[tuple[str, bytes | None]]:
-        """Like :meth:`take`, with one content in memory at a time.
+        """Yield what :meth:`take` returns, with one content in memory at a time.
 
         A file counts as taken when the next one is asked for: one that could not be sent is taken again.
         """
@@ -66,7 +66,7 @@ class Changes:
 
 
 def read_files(folder: Path, paths: Iterable[str]) -> dict[str, bytes]:
-    """Contents by path relative to the folder of the files there are among ``paths`` and in folders among them."""
+    """Return the contents, by path in the folder, of the files among ``paths`` and in folders among them."""
     return {path: (folder / path).read_bytes() for path, _ in file_states(folder, paths)}
 
 
@@ -80,7 +80,7 @@ def write_files(folder: Path, files: Mapping[str, bytes | None]) -> None:
 
 
 def file_states(folder: Path, paths: Iterable[str]) -> Iterator[tuple[str, FileState]]:
-    """Relative path and state of each file; a folder's files come in the order of their paths."""
+    """Yield relative path and state of each file; a folder's files come in the order of their paths."""
     for path in paths:
         inside = (Path(parent) / name for parent, _, names in os.walk(folder / path) for name in names)
         for file in [folder / path, *sorted(inside)]:

@@ -1,4 +1,4 @@
-"""Files that are whole or absent, folders that belong to one run, where commands may write, and shipped files."""
+"""Files that are whole or absent, folders that belong to one run, outputs that may be written, and shipped files."""
 
 import json
 import os
@@ -26,7 +26,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def shipped(name: str) -> Path:
-    """Path of a shipped folder, ``"sumo_net"`` or ``"models"``, in an installed wheel or in a checkout."""
+    """Return the path of a shipped folder, ``"sumo_net"`` or ``"models"``, in an installed wheel or in a checkout."""
     installed = _PACKAGE / "shipped" / name
     if installed.is_dir():
         return installed
@@ -54,7 +54,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def is_temporary(path: PurePath) -> bool:
-    """Whether a file is an unfinished one or a lock: nothing that a run leaves."""
+    """Return whether a file is unfinished or a lock, which no run leaves."""
     return path.suffix == ".partial" or path.name == LOCK_FILE
 
 
@@ -75,7 +75,7 @@ def read_json(path: Path, what: str, most_bytes: int = JSON_BYTES) -> dict[str, 
     """Read a JSON object.
 
     Raises:
-        InputError: the file is missing, too large or damaged; ``what`` names its role in the message.
+        InputError: the file is missing, too large or damaged; ``what`` is its role in the message.
     """
     from pydantic_core import from_json  # noqa: PLC0415 - where files are read, and nowhere else
 
@@ -104,7 +104,7 @@ def read_record(path: Path, what: str, kind: type[T], most_bytes: int = JSON_BYT
 
 
 def damaged(path: Path, what: str, error: object) -> InputError:
-    """Return what to raise where a file of a run does not say what it should."""
+    """Return the error for a file of a run whose content does not fit."""
     return InputError(f"{what}: {path} is damaged ({error}); restore it, or remove it and repeat the command")
 
 
@@ -138,7 +138,7 @@ def require_output_folder(folder: Path, argument: str = "out") -> None:
 
 
 def _require_no_run(path: Path, argument: str) -> None:
-    """Raise InputError if ``path`` is the folder of a run or lies in one: nobody else's files may be there."""
+    """Raise InputError if ``path`` is the folder of a run or lies in one, where no other files may be."""
     resolved = path.resolve()
     for folder in (resolved, *resolved.parents):
         if (folder / RUN_FILE).exists():
@@ -165,22 +165,22 @@ def _require_writable(folder: Path, argument: str) -> None:
 
 
 def _nearest_entry(path: Path) -> Path:
-    """``path``, or what is there of the folders that it lies in."""
+    """Return ``path`` if it exists, else the nearest folder above it that does."""
     return next(entry for entry in (path, *path.absolute().parents) if entry.exists())
 
 
 @contextmanager
 def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bool = True) -> Iterator[None]:
-    """In the block, ``folder`` is the home of the run described by ``settings``, a new one or that very run resumed.
+    """Reserve ``folder`` in the block for the run described by ``settings``, a new run or that very run resumed.
 
     One process at a time may work there; temporary files that killed processes left are removed. A new run that a
-    command begins is given provenance.json and config.yaml, which tell of the command; the runs that are parts of it
-    are not. They are no part of what the run is: another command line may resume it.
+    command begins gets provenance.json and config.yaml, which describe the command; the runs that are parts of it
+    do not. They are no part of what the run is: another command line may resume it.
 
     Args:
         folder: of the run.
-        settings: what the run follows from.
-        with_versions: note the versions of packages, too; of a run that writes them elsewhere they are left out.
+        settings: all that the run's results depend on.
+        with_versions: note the versions of packages, too; leave them out if the run writes them elsewhere.
 
     Raises:
         InputError: the folder holds another run or files of unknown origin, or another process is working there.
@@ -226,8 +226,8 @@ def _require_home(folder: Path, wanted: Mapping[str, Any]) -> None:
 
 
 def _is_strange(entry: Path) -> bool:
-    """Whether a folder's entry is none that a run leaves that was killed at its very beginning."""
-    if entry.name == CONFIG_FILE:  # one of the user's own is not overwritten
+    """Return whether an entry of a folder is not from a run that was killed at its very beginning."""
+    if entry.name == CONFIG_FILE:  # the user's file is not overwritten
         return not entry.with_name(PROVENANCE_FILE).exists()
     return not is_temporary(entry) and entry.name != PROVENANCE_FILE
 

@@ -64,7 +64,7 @@ def _work(
 
 
 def begin_work(environment: Mapping[str, str]) -> None:
-    """Call first in a worker, with the main process's environment variables: those of the server may be older."""
+    """Prepare a worker, with the main process's environment variables: those of the server may be older."""
     os.environ.clear()
     os.environ.update(environment)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})

@@ -1,4 +1,4 @@
-"""Where a run comes from: the command that began it, with its configuration, and the code that it ran."""
+"""Origin of a run: the command that began it, with its configuration, and the version of the code."""
 
 import platform
 import shlex
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -35,12 +35,12 @@ class Origin:
     """The command that this process is running."""
 
     words: tuple[str, ...]  # words of its command line
-    config: Callable[[], str]  # gives the configuration file that says the same
+    config: Callable[[], str]  # returns a configuration file with the same settings
 
     def provenance(self, *, with_versions: bool) -> dict[str, Any]:
-        """What JSON can hold of it, and of the code; without credentials."""
-        told = {"command": redact(shlex.join(["tint-sumo", *self.words])), "commit": commit()}
-        return {**told, "versions": versions(PACKAGES)} if with_versions else told
+        """Return the command and the version of the code for a JSON file, without credentials."""
+        found = {"command": redact(shlex.join(["tint-sumo", *self.words])), "commit": commit()}
+        return {**found, "versions": versions(PACKAGES)} if with_versions else found
 
 
 _ORIGIN: ContextVar[Origin | None] = ContextVar("origin", default=None)
@@ -48,7 +48,7 @@ _ORIGIN: ContextVar[Origin | None] = ContextVar("origin", default=None)
 
 @contextmanager
 def made_by(origin: Origin | None) -> Iterator[None]:
-    """What is made in the block comes from this command; None: from no command, or from one that is noted already."""
+    """Note this command as the origin of the block's runs; None: they have no command, or it is noted already."""
     token = _ORIGIN.set(origin)
     try:
         yield
@@ -61,20 +61,20 @@ def present_origin() -> Origin | None:
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Versions of installed packages, and of Python."""
+    """Return the versions of installed packages, and of Python."""
     return {name: version(name) for name in packages} | {"python": platform.python_version()}
 
 
 def version_text() -> str:
-    """Return the version of this package, and those of what it stands on in a second line."""
+    """Return the version of this package and, in a second line, those of the main packages that it uses."""
     shown = {"SUMO": "libsumo", "torch": "torch", "gymnasium": "gymnasium", "Python": "python"}
     found = versions(("tint_sumo", "libsumo", "torch", "gymnasium"))
     return f"tint-sumo {found['tint_sumo']}\n" + ", ".join(f"{name} {found[key]}" for name, key in shown.items())
 
 
-@cache
+@lru_cache(maxsize=1)
 def commit(checkout: Path = _CHECKOUT) -> str | None:
-    """The git commit of a checkout, with ``-dirty`` if files differ from it; None where there is no checkout."""
+    """Return the git commit of a checkout, with ``-dirty`` if files differ from it; None if it is no checkout."""
     if not (checkout / ".git").exists():  # an installed package may lie in the checkout of something else
         return None
     describe = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]

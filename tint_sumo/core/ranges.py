@@ -107,17 +107,17 @@ def _require(kind: Any, value: Any) -> None:
     arguments = get_args(kind)
     if get_origin(kind) is Annotated:
         _require(arguments[0], value)
-        for one in arguments[1:]:
-            if isinstance(one, Range):
-                one.check(value)
+        for mark in arguments[1:]:
+            if isinstance(mark, Range):
+                mark.check(value)
     elif get_origin(kind) in (Union, UnionType) and value is not None:
-        for one in arguments:
-            if _is_tuple(one) is isinstance(value, tuple | list):
-                _require(one, value)
+        for member in arguments:
+            if _is_tuple(member) is isinstance(value, tuple | list):
+                _require(member, value)
     elif get_origin(kind) is tuple:
         kinds = arguments[:1] * len(value) if arguments[-1] is ... else arguments
-        for one, item in zip(kinds, value, strict=False):
-            _require(one, item)
+        for item_kind, item in zip(kinds, value, strict=False):
+            _require(item_kind, item)
 
 
 def _is_tuple(kind: Any) -> bool:

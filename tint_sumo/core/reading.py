@@ -91,14 +91,14 @@ def _unpacks_to_too_much(path: Path, what: str, most_bytes: int) -> InputError:
 
 
 def is_gzipped(file: IO[bytes]) -> bool:
-    """Whether a file that was just opened is gzipped; it is read from its beginning again."""
+    """Return whether a file that was just opened is gzipped; it is read from its beginning again."""
     magic = file.read(2)
     file.seek(0)
     return magic == b"\x1f\x8b"
 
 
 def _unpacks_within(file: IO[bytes], most_bytes: int) -> bool:
-    """Whether a gzipped file has no more bytes than allowed; a damaged one is left to its reader, which says so."""
+    """Return whether a gzipped file has no more bytes than allowed; a damaged file is left to its reader."""
     unpacked = 0
     with gzip.GzipFile(fileobj=file) as stream:
         try:

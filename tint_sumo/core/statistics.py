@@ -26,7 +26,7 @@ class Rate:
 
     @property
     def interval(self) -> Interval:
-        """Of one policy: it leaves out the spread between trainings."""
+        """Wilson interval for one policy, without the spread between trainings."""
         from scipy.stats import binomtest  # noqa: PLC0415 - loads for half a second, and trainings need none of it
 
         found = binomtest(self.count, self.total).proportion_ci(CONFIDENCE, method="wilson")
@@ -34,9 +34,9 @@ class Rate:
 
 
 def rate_interval(hits: Hits) -> Interval:
-    """95 % interval of a method's rate, over training seeds and cases.
+    """Return the 95 % interval of a method's rate, over training seeds and cases.
 
-    Both are resampled, each with replacement, which is what a new study with other seeds and other cases would do
+    Both are resampled, each with replacement, as in a new study with other seeds and other cases
     (percentile bootstrap). With few seeds it is somewhat too narrow.
     """
     seeds, cases = (np.arange(size) for size in hits.shape)
@@ -44,7 +44,7 @@ def rate_interval(hits: Hits) -> Interval:
 
 
 def difference_interval(first: Hits, second: Hits) -> Interval:
-    """95 % interval of the first method's rate minus the second's, on the same cases; their seeds are not paired."""
+    """Return the 95 % interval of one method's rate minus another's on the same cases; their seeds are not paired."""
     seeds, others, cases = (np.arange(size) for size in (first.shape[0], second.shape[0], first.shape[1]))
     return _interval((seeds, others, cases), lambda s, o, c: _mean(first, s, c) - _mean(second, o, c))
 
@@ -67,5 +67,5 @@ def _interval(samples: Sequence[NDArray[np.int64]], statistic: Callable[..., NDA
 
 
 def _mean(hits: Hits, seeds: NDArray[np.int64], cases: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Mean over some seeds and cases, given by indices (..., S) and (..., C)."""
+    """Return the mean over some seeds and cases, given by indices (..., S) and (..., C)."""
     return np.asarray(hits[seeds[..., :, None], cases[..., None, :]].mean(axis=(-2, -1)))

@@ -38,12 +38,12 @@ _ADVICE_ON_OTHERS = "use a URL such as s3://bucket/folder, gs://bucket/folder or
 
 
 def is_url(out: str | Path) -> bool:
-    """Whether an output place is given as a URL; as a Path it would have lost a slash, so URLs stay text."""
+    """Return whether an output folder is given as a URL; a Path would lose a slash, so URLs stay text."""
     return "://" in str(out)
 
 
 def name_in(out: str | Path, path: PurePosixPath | Path | str) -> str:
-    """Return what the user calls a file of the output folder ``out``, a folder or a URL; ``path`` is relative to it."""
+    """Return a file's name as the user writes it: ``path`` in the output folder ``out``, a folder or a URL."""
     if not is_url(out):
         return str(Path(out) / path)
     folder, mark, options = redact(str(out)).partition("?")
@@ -64,12 +64,12 @@ class Store:
     url: str
 
     @classmethod
-    def at(cls, place: str | Path) -> "Store":
-        """The store at a URL, or a folder of this machine as a store."""
-        return cls(str(place) if is_url(place) else Path(place).resolve().as_uri())
+    def at(cls, out: str | Path) -> "Store":
+        """Return the store at a URL, or a folder of this machine as a store."""
+        return cls(str(out) if is_url(out) else Path(out).resolve().as_uri())
 
     def files(self, under: str = "") -> dict[str, int]:
-        """Sizes in bytes by path in the store of the files in its folder ``under``; empty where nothing is there."""
+        """Return the sizes in bytes, by path in the store, of the files in its folder ``under``."""
         from pyarrow.fs import FileSelector, FileType  # noqa: PLC0415
 
         with self._reported("read"):
@@ -90,7 +90,7 @@ class Store:
             return PurePosixPath(self._home[1]).name
 
     def exists(self, path: str) -> bool:
-        """Whether there is such a file."""
+        """Return whether there is such a file."""
         with self._reported("read"):
             filesystem, _ = self._home
             return bool(filesystem.get_file_info(self._path(path)).is_file)
@@ -122,7 +122,7 @@ class Store:
 
     @cached_property
     def _home(self) -> tuple[Any, str]:
-        """Arrow's file system and the folder's path in it."""
+        """Return Arrow's file system and the folder's path in it."""
         from pyarrow.fs import FileSystem  # noqa: PLC0415
 
         url = urlsplit(quote(self.url, safe="%/:?&=+,;@!$'()*[]~"))
@@ -152,7 +152,7 @@ class Store:
 
     @contextmanager
     def _reported(self, doing: str) -> Iterator[None]:
-        """Raise what Arrow raises in the block as InputError."""
+        """Raise InputError for the exceptions of Arrow in the block."""
         try:
             yield
         except (OSError, ValueError, NotImplementedError) as error:
@@ -163,7 +163,7 @@ class Store:
 
 @contextmanager
 def working_folder(out: str | Path, without: tuple[str, ...] = ()) -> Iterator[Path]:
-    """A folder of this machine that stands for ``out`` in the block: ``out`` itself unless it is a URL.
+    """Give, in the block, a folder of this machine that stands for ``out``: ``out`` itself unless it is a URL.
 
     For a URL it is a temporary folder that begins with the files of the store. While the block runs, the files that
     have changed are sent there every PUSH_INTERVAL_S, older ones first: where a file is, so are those that were written
@@ -214,7 +214,7 @@ class _PushError(InputError):
 
 @contextmanager
 def _pushing(store: Store, folder: Path) -> Iterator[None]:
-    """Send what changes in a folder, regularly and when the block ends."""
+    """Send the changes in a folder, regularly and when the block ends."""
     changes = Changes(folder)
     ended = threading.Event()
     regularly = threading.Thread(target=_push_regularly, args=(store, changes, ended), daemon=True)
@@ -235,7 +235,7 @@ def _push_regularly(store: Store, changes: Changes, ended: threading.Event) -> N
         return not ended.is_set()
 
     while not ended.wait(PUSH_INTERVAL_S):
-        with suppress(InputError):  # what could not be sent is sent next time; the last push tells of what never was
+        with suppress(InputError):  # files that could not be sent are sent next time; the last push raises
             _push(store, takewhile(goes_on, changes.take_each(time.time())))
 
 

@@ -41,7 +41,7 @@ def _flush(stream: TextIO) -> None:
 
 
 def has_lost_reader() -> bool:
-    """Whether stdout or stderr is a pipe from which nobody reads any more."""
+    """Return whether stdout or stderr is a pipe from which nobody reads any more."""
     return any(_has_no_reader(stream) for stream in (sys.stdout, sys.stderr) if stream is not None)
 
 

@@ -1,4 +1,4 @@
-"""Dataclasses from what a file says, and back. Pydantic checks the types; its errors become one clear line each."""
+"""Dataclasses from the content of files, and back. Pydantic checks types; its errors become one clear line each."""
 
 import json
 from abc import ABC, abstractmethod
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # ruff: noqa: PLC0415
 
 T = TypeVar("T")
-Where = tuple[str | int, ...]  # leads to a value: names of fields, and numbers of list items from 0
+Where = tuple[str | int, ...]  # path to a value: names of fields, and numbers of list items from 0
 
 _WORDS = {
     int: "a whole number",
@@ -50,7 +50,7 @@ _LONGEST_NAME = 80  # characters
 
 
 class FieldError(InputError):
-    """A value that does not fit: ``where`` it is, what is wrong with it, and where ``others`` are."""
+    """A value that does not fit: its path ``where``, the ``problem``, and the paths of ``others``."""
 
     def __init__(self, where: Where, problem: str, others: Sequence[Where] = ()) -> None:
         also = f"; also wrong: {', '.join(map(dotted, others[:_MOST_OTHERS]))}" if others else ""
@@ -61,7 +61,7 @@ class FieldError(InputError):
 
 
 def dotted(where: Where) -> str:
-    """The way to a value for people, such as ``budget.seeds[0]``."""
+    """Return the path to a value for people, such as ``budget.seeds[0]``."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{_printed(part)}" for part in where).removeprefix(".")
 
 
@@ -72,9 +72,9 @@ def _printed(name: str) -> str:
 
 @dataclass(frozen=True)
 class ReadBy:
-    """Of a type that a file can give in a form of its own; beside the type, as ``Annotated[Scene, ReadBy(find)]``."""
+    """Reader of a type with a special form in files; beside the type, as ``Annotated[Scene, ReadBy(find)]``."""
 
-    read: Callable[[Any], Any]  # makes the value of what the file gives; raises FieldError
+    read: Callable[[Any], Any]  # makes the value from the file's; raises FieldError
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic_core import core_schema
@@ -106,7 +106,7 @@ class FileForm(ABC):
 
 
 class OneOrMany:
-    """Of a tuple of any length: a file may give its only item without a list."""
+    """Mark of a tuple of any length whose only item a file may give without a list."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         def read(value: Any) -> Any:
@@ -124,12 +124,12 @@ Many = Annotated[tuple[T, ...], OneOrMany()]
 
 
 def build(kind: Any, value: Any, where: Where = ()) -> Any:
-    """Return what a file says as a value of a type: a dataclass, a tuple, a union, a literal, or a plain type.
+    """Return a file's content as a value of a type: a dataclass, a tuple, a union, a literal, or a plain type.
 
     Args:
         kind: the type.
-        value: of what JSON and YAML know: null, true, numbers, text, lists and mappings.
-        where: the way to the value in its file, for messages.
+        value: as JSON and YAML have it: null, true, numbers, text, lists and mappings.
+        where: the path to the value in its file, for messages.
 
     Raises:
         FieldError: the value does not fit the type.
@@ -138,7 +138,7 @@ def build(kind: Any, value: Any, where: Where = ()) -> Any:
 
 
 def build_json(kind: Any, text: bytes, where: Where = ()) -> Any:
-    """Return what a text in JSON says as a value of a type.
+    """Return a text in JSON as a value of a type.
 
     Raises:
         FieldError: the text is not JSON, or the value does not fit the type.
@@ -172,7 +172,7 @@ def overlay(base: T, value: Any, where: Where = ()) -> T:
 
 
 def _merged(base: Any, value: Any) -> Any:
-    """What a file says of a dataclass, and what the dataclass says where the file is silent."""
+    """Return the values of a file for a dataclass, and those of the dataclass that the file does not give."""
     if not isinstance(value, Mapping):
         return value
     hints = get_type_hints(type(base), include_extras=True)
@@ -182,10 +182,10 @@ def _merged(base: Any, value: Any) -> Any:
 
 
 def choose(value: Any, named: Mapping[str, T], default: str, where: Where = ()) -> str | T:
-    """What a file means by a name, or by a mapping of what differs from the one that it calls its ``base``.
+    """Return the known value that a file names, or a new one: a mapping of its ``base`` and the numbers that differ.
 
     Returns:
-        The name of a known one, or a new one that differs from all of them.
+        A name among the known, or a value that differs from all of them.
 
     Raises:
         FieldError: there is no such name, or a value does not fit.
@@ -193,12 +193,12 @@ def choose(value: Any, named: Mapping[str, T], default: str, where: Where = ()) 
     if not is_mapping(value, named, where):
         return require_known(value, named, where)
     name = require_base(value, named, default, where)
-    changed = overlay(named[name], {key: one for key, one in value.items() if key != "base"}, where)
-    return next((known for known, one in named.items() if one == changed), changed)
+    changed = overlay(named[name], {key: changes for key, changes in value.items() if key != "base"}, where)
+    return next((known for known, settings in named.items() if settings == changed), changed)
 
 
 def is_mapping(value: Any, named: Mapping[str, Any], where: Where) -> bool:
-    """Whether a file gives a mapping in place of a name.
+    """Return whether a file gives a mapping in place of a name.
 
     Raises:
         FieldError: it gives neither.
@@ -209,19 +209,19 @@ def is_mapping(value: Any, named: Mapping[str, Any], where: Where) -> bool:
 
 
 def require_base(value: Mapping[str, Any], named: Mapping[str, Any], default: str, where: Where) -> str:
-    """The name that a mapping calls its ``base``, if it is a known one.
+    """Return the name that a mapping gives as its ``base``.
 
     Raises:
-        FieldError: it is not.
+        FieldError: it is unknown.
     """
     return require_known(value.get("base", default), named, (*where, "base"))
 
 
 def require_known(name: Any, known: Mapping[str, Any] | Sequence[str], where: Where) -> str:
-    """``name``, if it is one of the known ones.
+    """Return ``name`` if it is among the known names.
 
     Raises:
-        FieldError: it is not.
+        FieldError: it is unknown.
     """
     if not isinstance(name, str) or name not in known:
         nearest, known_names = _nearest(str(name)[:80], known), ", ".join(known)
@@ -243,14 +243,14 @@ def plain(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in fields(value) if field.init}
     if isinstance(value, Mapping):
-        return {str(key): plain(one) for key, one in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, tuple | list):
-        return [plain(one) for one in value]
+        return [plain(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 
 
 def is_required(field: Any) -> bool:
-    """Whether a dataclass's field has no default."""
+    """Return whether a dataclass's field has no default."""
     return field.default is MISSING and field.default_factory is MISSING
 
 
@@ -258,36 +258,36 @@ def is_required(field: Any) -> bool:
 
 
 def _field_error(kind: Any, errors: Iterable[Mapping[str, Any]], where: Where) -> FieldError:
-    """The first error in full, and where others are."""
+    """Return the first error in full, with the paths of the others."""
     found: dict[Where, str] = {}
-    of_unions: dict[Where, str] = {}  # pydantic tries each member of a union; the value may have the shape of none
+    of_unions: dict[Where, str] = {}  # pydantic tries each member of a union; the value may fit the form of none
     missing: dict[Where, list[str]] = {}
     for error in errors:
-        place, expected, union = _find(kind, error["loc"][1:])
-        problem = error.get("ctx", {}).get("error")
-        if error["type"] == "missing" and place and isinstance(place[-1], str):
-            missing.setdefault(place[:-1], []).append(place[-1])
+        path, expected, union = _find(kind, error["loc"][1:])
+        cause = error.get("ctx", {}).get("error")
+        if error["type"] == "missing" and path and isinstance(path[-1], str):
+            missing.setdefault(path[:-1], []).append(path[-1])
         elif error["type"] == "unexpected_keyword_argument":
-            found.setdefault(place, _unknown(str(place[-1]), _names(_find(kind, error["loc"][1:-1])[1])))
-        elif isinstance(problem, FieldError):
-            found.setdefault((*place, *problem.where), problem.problem)
-            for other in problem.others:
-                found.setdefault((*place, *other), "")
+            found.setdefault(path, _unknown(str(path[-1]), _names(_find(kind, error["loc"][1:-1])[1])))
+        elif isinstance(cause, FieldError):
+            found.setdefault((*path, *cause.where), cause.problem)
+            for other in cause.others:
+                found.setdefault((*path, *other), "")
         elif error["type"] in ("value_error", "json_invalid"):
-            found.setdefault(place, str(problem))
+            found.setdefault(path, str(cause))
         else:
             if error["type"] == "missing":  # a tuple is too short
-                place, expected, union = _find(kind, error["loc"][1:-1])
+                path, expected, union = _find(kind, error["loc"][1:-1])
             text = f"must be {_words(expected)}, not {shown(error['input'])}"
-            (of_unions if place == union else found).setdefault(place, text)
-    found |= {place: f"{', '.join(names)} must be given" for place, names in missing.items()}
-    found |= {at: text for at, text in of_unions.items() if not any(one[: len(at)] == at for one in found)}
+            (of_unions if path == union else found).setdefault(path, text)
+    found |= {path: f"{', '.join(names)} must be given" for path, names in missing.items()}
+    found |= {at: text for at, text in of_unions.items() if not any(path[: len(at)] == at for path in found)}
     (first, problem), *others = found.items()
-    return FieldError((*where, *first), problem, [(*where, *place) for place, _ in others])
+    return FieldError((*where, *first), problem, [(*where, *path) for path, _ in others])
 
 
 def _find(kind: Any, location: Sequence[str | int]) -> tuple[Where, Any, Where | None]:
-    """Where pydantic's location is, which type the value there should have, and where the last union on the way is."""
+    """Return the path of pydantic's location, the type of the value there, and the path of the last union on it."""
     where: Where = ()
     union = None
     parts = list(location)
@@ -297,7 +297,7 @@ def _find(kind: Any, location: Sequence[str | int]) -> tuple[Where, Any, Where |
             union = where
             parts.pop(0)
             if parts:
-                kind = next((one for one in members if _has_parts(one, parts[0])), None)
+                kind = next((member for member in members if _has_parts(member, parts[0])), None)
             continue
         where = (*where, parts[0])
         kind = _part(members[0], parts.pop(0))
@@ -305,20 +305,20 @@ def _find(kind: Any, location: Sequence[str | int]) -> tuple[Where, Any, Where |
 
 
 def _members(kind: Any) -> list[Any]:
-    """The types of a union, without what they are annotated with and without null; a type itself is its only one."""
+    """Return the types of a union without annotations and without null, or a list of a type that is no union."""
     kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     if get_origin(kind) not in (Union, UnionType):
         return [kind]
-    return [member for one in get_args(kind) if one is not NoneType for member in _members(one)]
+    return [member for part in get_args(kind) if part is not NoneType for member in _members(part)]
 
 
 def _has_parts(kind: Any, part: str | int) -> bool:
-    """Whether values of a type have items with numbers, or with names."""
+    """Return whether values of a type have parts like this one, with a number or with a name."""
     return (get_origin(kind) is tuple) is isinstance(part, int)
 
 
 def _part(kind: Any, part: str | int) -> Any:
-    """The type of a part of a value of this type; None if it has no such part."""
+    """Return the type of a part of a value of this type; None if it has no such part."""
     if is_dataclass(kind):
         return get_type_hints(kind, include_extras=True).get(str(part))
     kinds = get_args(kind)
@@ -328,20 +328,20 @@ def _part(kind: Any, part: str | int) -> Any:
 
 
 def _is_variadic(kind: Any) -> bool:
-    """Whether a tuple's type is that of any number of items."""
+    """Return whether tuples of this type may have any number of items."""
     return get_args(kind)[-1] is ...
 
 
 def _names(kind: Any) -> list[str]:
-    """The fields of a dataclass that a file can give, also of one among other types."""
-    return [field.name for one in _members(kind) if is_dataclass(one) for field in fields(one) if field.init]
+    """Return the fields that a file can give of the dataclasses in a type."""
+    return [field.name for part in _members(kind) if is_dataclass(part) for field in fields(part) if field.init]
 
 
 def _words(kind: Any) -> str:
-    """What a type allows."""
+    """Return the values that a type allows, in words."""
     arguments = get_args(kind)
     if get_origin(kind) is Annotated:
-        limits = [str(one) for one in arguments[1:] if isinstance(one, Range)]
+        limits = [str(mark) for mark in arguments[1:] if isinstance(mark, Range)]
         return " ".join([_words(arguments[0]), *limits])
     if isinstance(kind, type) and is_dataclass(kind):
         return kind.form if issubclass(kind, FileForm) else f"a mapping of {', '.join(_names(kind))}"

@@ -16,13 +16,13 @@ _HYPERPARAMETERS = "hyperparameters"
 
 
 def open_log(out: Path, hyperparameters: Mapping[str, Any], results: Sequence[str], step: int = 0) -> Logger:
-    """The log of the training in ``out``, which is continued if there is one.
+    """Open the log of the training in ``out``, an existing log at its end.
 
     Args:
         out: the training's folder; the log goes into ``tensorboard`` there.
         hyperparameters: settings of the training; nested ones get names with dots.
         results: names of the curves whose last values stand beside them.
-        step: how far an earlier call has come.
+        step: the last step of an earlier call.
     """
     logger = configure(str(out / FOLDER), ["tensorboard"])
     logger.record(_HYPERPARAMETERS, HParam(dict(_flat(hyperparameters, "")), dict.fromkeys(results, 0.0)))
@@ -31,7 +31,7 @@ def open_log(out: Path, hyperparameters: Mapping[str, Any], results: Sequence[st
 
 
 def _flat(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    """Names and values of nested settings, as TensorBoard takes them."""
+    """Yield names and values of nested settings, as TensorBoard takes them."""
     for name, value in settings.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f"{prefix}{name}.")
@@ -40,7 +40,7 @@ def _flat(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]
 
 
 def log_film(logger: Logger, name: str, gif: bytes, step: int) -> None:
-    """Log a film, which TensorBoard plays among its images; its own videos would need moviepy."""
+    """Log a film, which TensorBoard plays among its images; a video would need moviepy."""
     with Image.open(io.BytesIO(gif)) as first:
         image = Summary.Image(width=first.width, height=first.height, colorspace=3, encoded_image_string=gif)
     for output in logger.output_formats:

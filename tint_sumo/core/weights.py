@@ -20,7 +20,7 @@ _TYPES = {"F32": torch.float32, "F64": torch.float64, "I64": torch.int64, "BOOL"
 
 
 def write_weights(file: Path, weights: Mapping[str, Tensor]) -> dict[str, str]:
-    """Write the weights; what the card says about the file."""
+    """Write the weights; return the card's entries about the file."""
     content = safetensors.torch.save(dict(weights))
     write_bytes(file, content)
     return {SHA256: hashlib.sha256(content).hexdigest()}
@@ -38,7 +38,7 @@ def read_weights(
         file: of the weights.
         card_file: file of the card, for messages.
         build: makes the network; it is called to look at the sizes of weights alone.
-        card: what the card says; weights without a checksum there are read, and a line on stderr says so.
+        card: content of the card; weights without a checksum there are read, with a line on stderr.
 
     Raises:
         InputError: the file is missing, damaged, not the one that the card describes, or holds a number that is not
@@ -51,10 +51,10 @@ def read_weights(
     try:
         with safe_open(file, framework="pt") as header:
             slices = {name: header.get_slice(name) for name in header.keys()}  # noqa: SIM118 - no mapping
-            found = {name: (_TYPES.get(one.get_dtype()), tuple(one.get_shape())) for name, one in slices.items()}
+            found = {name: (_TYPES.get(part.get_dtype()), tuple(part.get_shape())) for name, part in slices.items()}
     except (OSError, SafetensorError):
         raise InputError(damaged) from None
-    if any(wanted.get(name) != one for name, one in found.items()):
+    if any(wanted.get(name) != form for name, form in found.items()):
         raise InputError(f"{card_file} does not fit the weights beside it; restore both files")
     content = read_file(file, "weights", WEIGHTS_BYTES)
     if SHA256 not in card:

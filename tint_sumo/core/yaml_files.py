@@ -1,4 +1,4 @@
-"""YAML files: read with the lines that values stand in, written with a comment above each setting."""
+"""YAML files: read with the lines of their values, written with a comment above each setting."""
 
 import ast
 import inspect
@@ -20,7 +20,7 @@ from tint_sumo.core.structures import FieldError, Where, dotted, plain
 _MOST_VALUES = 20_000  # in a file
 _MOST_DIGITS = 60
 _NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
-# What PyYAML raises for text that is no YAML, for aliases within what they stand for, and for tags that do not fit.
+# Exceptions of PyYAML for text that is no YAML, for aliases within what they stand for, and for tags that do not fit.
 _DAMAGE = (yaml.YAMLError, RecursionError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 _END = "\n"
 _WIDTH = 116  # width of comments and lists
@@ -34,16 +34,16 @@ class _Dumper(yaml.SafeDumper):
     """Puts text in quotes that the loader would take for a number."""
 
 
-for _one in (_Loader, _Dumper):
-    _one.add_implicit_resolver(
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver(
         "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
     )
 
 
 _OTHERS = tuple(f"tag:yaml.org,2002:{name}" for name in ("timestamp", "binary", "set", "omap", "pairs"))
-_Loader.yaml_constructors = {tag: one for tag, one in _Loader.yaml_constructors.items() if tag not in _OTHERS}
+_Loader.yaml_constructors = {tag: make for tag, make in _Loader.yaml_constructors.items() if tag not in _OTHERS}
 _Loader.yaml_implicit_resolvers = {
-    first: [one for one in resolvers if one[0] not in _OTHERS]
+    first: [resolver for resolver in resolvers if resolver[0] not in _OTHERS]
     for first, resolvers in _Loader.yaml_implicit_resolvers.items()
 }
 
@@ -57,7 +57,7 @@ class YamlFile:
     lines: Mapping[Where, int]
 
     def located(self, error: FieldError) -> InputError:
-        """The error with the file and the line that it is about."""
+        """Return the error with the file and the line that it is about."""
         known = (error.where[:length] for length in range(len(error.where), -1, -1))
         line = next((self.lines[where] for where in known if where in self.lines), 1)
         return InputError(f"{self.file}, line {line}: {error}")
@@ -87,7 +87,7 @@ def read_yaml(file: Path) -> YamlFile:
 
 
 def _parse(text: str) -> tuple[Any, dict[Where, int]]:
-    """What a text says, and the lines of its values."""
+    """Return the content of a text, and the lines of its values."""
     loader = _Loader(text)
     try:
         root = loader.get_single_node()
@@ -102,7 +102,7 @@ def _parse(text: str) -> tuple[Any, dict[Where, int]]:
 
 
 def read_list(text: str) -> list[Any]:
-    """The values of a list without its brackets, such as ``1e-3, [64, 64], true``.
+    """Return the values of a list without its brackets, such as ``1e-3, [64, 64], true``.
 
     Raises:
         InputError: it is not YAML.
@@ -115,20 +115,20 @@ def read_list(text: str) -> list[Any]:
 
 
 def _lines(node: yaml.Node, where: Where) -> Iterator[tuple[Where, int]]:
-    """The way to each value below a node, and the line it begins in."""
+    """Yield the path to each value below a node, and the line it begins in."""
     if isinstance(node, yaml.ScalarNode):
         _require_text(node)
     elif isinstance(node, yaml.MappingNode):
         seen = set()
         for key, value in node.value:
-            line, way = key.start_mark.line + 1, (*where, str(key.value))
+            line, path = key.start_mark.line + 1, (*where, str(key.value))
             if isinstance(key, yaml.ScalarNode):
                 _require_text(key)
-            if way in seen:
-                raise FieldError((), f"line {line}: {dotted(way)} is said twice; leave one of them")
-            seen.add(way)
-            yield way, line
-            yield from _lines(value, way)
+            if path in seen:
+                raise FieldError((), f"line {line}: {dotted(path)} is said twice; leave one of them")
+            seen.add(path)
+            yield path, line
+            yield from _lines(value, path)
     elif isinstance(node, yaml.SequenceNode):
         for number, item in enumerate(node.value):
             yield (*where, number), item.start_mark.line + 1
@@ -138,7 +138,7 @@ def _lines(node: yaml.Node, where: Where) -> Iterator[tuple[Where, int]]:
 def _require_text(node: yaml.ScalarNode) -> None:
     """Raise FieldError if a value has characters that no name of a file has, or is too long to be a number."""
     line = node.start_mark.line + 1
-    if "\0" in node.value or any("\ud800" <= one <= "\udfff" for one in node.value):
+    if "\0" in node.value or any("\ud800" <= letter <= "\udfff" for letter in node.value):
         raise FieldError((), f"line {line}: {node.value!r} has a character that is no text; leave it out")
     if len(node.value) > _MOST_DIGITS and node.tag in _NUMBERS:
         raise FieldError((), f"line {line}: a number has more than {_MOST_DIGITS} digits; give fewer")
@@ -152,7 +152,7 @@ def _syntax(error: Exception) -> str:
 
 
 def to_yaml(values: Mapping[str, Any], notes: Mapping[str, str]) -> str:
-    """Settings as YAML, each below its note; those of dataclasses below what their docstrings say."""
+    """Return settings as YAML, each below its note; fields of dataclasses have their docstrings as notes."""
     return "\n".join(_block(values, notes)) + "\n"
 
 
@@ -168,7 +168,7 @@ def _block(values: Mapping[str, Any], notes: Mapping[str, str]) -> Iterator[str]
 
 
 def _entry(key: str, value: Any) -> list[str]:
-    """The lines of a value; lists of plain values are in one line each."""
+    """Return the lines of a value; lists of plain values are in one line each."""
     if isinstance(value, list | dict):
         block: str = yaml.dump({key: value}, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=_WIDTH)
         return block.rstrip("\n").split("\n")
@@ -178,15 +178,15 @@ def _entry(key: str, value: Any) -> list[str]:
 
 
 def field_notes(kind: type) -> dict[str, str]:
-    """The docstrings below the fields of a dataclass and of its parents."""
+    """Return the docstrings below the fields of a dataclass and of its parents."""
     notes: dict[str, str] = {}
-    for one in reversed(kind.__mro__):
-        if is_dataclass(one):
-            notes |= _own_notes(one)
+    for parent in reversed(kind.__mro__):
+        if is_dataclass(parent):
+            notes |= _notes_in(parent)
     return notes
 
 
-def _own_notes(kind: type) -> dict[str, str]:
+def _notes_in(kind: type) -> dict[str, str]:
     parsed = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
     assert isinstance(parsed, ast.ClassDef)
     notes = {}

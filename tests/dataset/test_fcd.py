@@ -54,7 +54,7 @@ def found(file: Path) -> pd.DataFrame:
     return vehicles(file)
 
 
-def test_it_tells_what_the_rows_tell(found: pd.DataFrame, rows: pd.DataFrame) -> None:
+def test_it_contains_what_the_rows_contain(found: pd.DataFrame, rows: pd.DataFrame) -> None:
     keys = found["id"].str.split(".", expand=True).astype(int).set_axis(["episode", "vehicle"], axis=1)
     both = pd.concat([found, keys], axis=1)
     both["time_s"] = (found["time"] - EPISODE_PERIOD_S * both["episode"]).round(1)
@@ -88,7 +88,7 @@ def test_vehicles_are_where_the_network_has_their_lanes(found: pd.DataFrame) -> 
         np.testing.assert_allclose(part[["x", "y"]], expected, atol=2 * ROUNDING)
 
 
-def test_nothing_tells_the_trait(found: pd.DataFrame, file: Path) -> None:
+def test_nothing_gives_the_trait_away(found: pd.DataFrame, file: Path) -> None:
     assert found["type"].unique().tolist() == [VEHICLE_TYPE]
     text = gzip.decompress(file.read_bytes()).decode()
     assert "conservative" not in text

@@ -78,7 +78,7 @@ def test_the_figure(dataset: Path, tmp_path: Path) -> None:
         assert tuple(map(int, profile.colour.split(","))) in colours
 
 
-def test_a_trait_nobody_has(dataset: Path, tmp_path: Path) -> None:
+def test_a_trait_that_no_driver_has(dataset: Path, tmp_path: Path) -> None:
     some = Distribution.of(pd.Series([2.4]))
     lonely = Inspection(
         read_manifest(dataset),

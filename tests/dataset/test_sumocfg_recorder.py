@@ -181,7 +181,7 @@ def test_the_figure_of_many_vtypes_names_those_that_drive_and_has_room_for_them(
         (["--sumocfg", "{wrong}"], "SUMO does not run"),
     ],
 )
-def test_bad_input_is_told_in_one_line(
+def test_bad_input_is_refused_in_one_line(
     arguments: list[str], message: str, user_network: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     merge = user_network("merge")

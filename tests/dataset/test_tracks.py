@@ -92,7 +92,7 @@ def test_offsets_go_on_across_lanes(tmp_path: Path) -> None:
     assert rows["track"].tolist() == [0] * 4
 
 
-def test_speeds_tell_displacements_to_the_millimetre_unless_positions_contradict(tmp_path: Path) -> None:
+def test_speeds_give_displacements_to_the_millimetre_unless_positions_contradict(tmp_path: Path) -> None:
     rounded = {0.1 * step: [("a", "e_0", round(0.234 * step, 2), 2.34)] for step in range(6)}
     assert offsets_m(tracks(tmp_path, rounded)) == pytest.approx([0.234 * step for step in range(6)])
     wrong = {0.1 * step: [("a", "e_0", 0.5 * step, 0.0)] for step in range(3)}

@@ -1,4 +1,4 @@
-"""Windows, and that nothing in them tells the label."""
+"""Windows, and that nothing in them gives the label away."""
 
 import json
 import resource
@@ -97,7 +97,7 @@ def test_training_windows_come_shard_by_shard(two_shards: Path) -> None:
         np.testing.assert_array_equal(column, getattr(windows[train], field.name))
 
 
-# The label leak: in the authors' code a driver without a leader got a gap that told its trait.
+# The label leak: in the authors' code a driver without a leader got a gap that gave its trait away.
 
 
 def test_changing_every_label_leaves_the_inputs_as_they_are(dataset: Path, tmp_path: Path) -> None:
@@ -118,8 +118,8 @@ def test_changing_every_label_leaves_the_inputs_as_they_are(dataset: Path, tmp_p
 
 
 def test_trajectories_have_no_column_of_the_driver() -> None:
-    told = {"trait", "vtype", "type", "desired_speed_mps", "min_gap_m", "tau_s", "colour"}
-    assert not told & set(TRAJECTORY_SCHEMA.names)
+    revealing = {"trait", "vtype", "type", "desired_speed_mps", "min_gap_m", "tau_s", "colour"}
+    assert not revealing & set(TRAJECTORY_SCHEMA.names)
 
 
 def test_drivers_that_move_alike_look_alike_whatever_their_trait() -> None:
@@ -147,7 +147,7 @@ def test_drivers_that_move_alike_look_alike_whatever_their_trait() -> None:
     np.testing.assert_array_equal(found[0], found[1])
 
 
-def test_numbers_and_order_do_not_tell_the_trait(dataset: Path) -> None:
+def test_numbers_and_order_do_not_give_the_trait_away(dataset: Path) -> None:
     """Episode and vehicle numbers, and being leaderless, are no better than guessing."""
     windows = load_windows(dataset)
     label = load_labels(dataset, windows)
@@ -205,7 +205,7 @@ def test_rows_that_are_missing(dataset: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("more", [-1, 1])
-def test_other_windows_than_the_manifest_tells_of(dataset: Path, tmp_path: Path, more: int) -> None:
+def test_other_windows_than_in_the_manifest(dataset: Path, tmp_path: Path, more: int) -> None:
     shutil.copytree(dataset, tmp_path / "d")
     manifest = json.loads((tmp_path / "d" / MANIFEST).read_text())
     (tmp_path / "d" / MANIFEST).write_text(json.dumps(manifest | {"windows": manifest["windows"] + more}))

@@ -102,7 +102,7 @@ def test_every_weight_is_stored_once(saved: Path) -> None:
     assert sorted(path.name for path in saved.parent.iterdir()) == ["policy.json", "policy.safetensors"]
 
 
-def test_the_card_tells_what_it_was_given_and_what_the_network_is(saved: Path) -> None:
+def test_the_card_keeps_its_entries_and_describes_the_network(saved: Path) -> None:
     card = read_policy_card(saved)
     assert card["method"] == "oracle"
     assert card["network"]["trait_size"] == 2
@@ -218,7 +218,7 @@ def test_an_unreadable_card_is_reported(saved: Path, text: str) -> None:
         {"actions": None},
     ],
 )
-def test_networks_nobody_can_build_are_reported(saved: Path, network: Mapping[str, Any]) -> None:
+def test_impossible_networks_are_reported(saved: Path, network: Mapping[str, Any]) -> None:
     card = read_policy_card(saved)
     card_file(saved).write_text(json.dumps({**card, "network": {**card["network"], **network}}))
     assert "policy.json: unusable network" in refused(saved)

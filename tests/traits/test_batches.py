@@ -26,7 +26,7 @@ def test_a_driver_whose_windows_are_scattered_is_refused():
 def test_a_batch_holds_another_window_of_each_driver(street):
     windows, _ = street
     windows = replace(windows, states=windows.states.copy())
-    windows.states[:, 0, 0] = windows.driver  # so that a window can be told by its states
+    windows.states[:, 0, 0] = windows.driver  # so that a window's driver is known from its states
     index = torch.arange(0, len(windows), 3)
     batch = TrainingWindows(windows, with_other=True).batch(index, torch.Generator().manual_seed(0))
     assert batch.conservative is None

@@ -25,7 +25,7 @@ def model(small, street) -> CrossWindow:
 
 
 def test_what_noise_leaves_open_shows_as_uncertainty(small, tmp_path):
-    """A noisy window of three steps hardly tells 2.4 from 3 m/s, one of twenty does."""
+    """A noisy window of three steps hardly distinguishes 2.4 from 3 m/s, one of twenty does."""
     windows, _ = two_populations(600, windows_each=4, shortest=3)
     settings = replace(small, hidden_size=16, learning_rate=1e-2, epochs=12, noise_m=0.1)
     model = train(windows, settings, tmp_path, method="cross_window")

@@ -62,19 +62,19 @@ def test_training_sees_the_training_episodes_only(
     }
 
 
-def test_a_method_with_labels_is_told_who_is_conservative(
+def test_a_method_with_labels_learns_from_the_conservative_drivers(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[tuple[Windows, np.ndarray]] = []
+    taken: list[tuple[Windows, np.ndarray]] = []
     original = datasets.train
 
     def train(windows: Windows, *args: Any, conservative: np.ndarray, **kwargs: Any) -> Any:
-        told.append((windows, conservative))
+        taken.append((windows, conservative))
         return original(windows, *args, conservative=conservative, **kwargs)
 
     monkeypatch.setattr(datasets, "train", train)
     train_traits(dataset, tmp_path / "run", method="classifier", settings=SMALL, seed=SEED)
-    ((windows, conservative),) = told
+    ((windows, conservative),) = taken
     np.testing.assert_array_equal(conservative, load_labels(dataset, windows) == CONSERVATIVE_LABEL)
 
 
@@ -113,7 +113,7 @@ def test_evaluation_and_pictures_take_the_episodes_left_out_by_the_model_s_seed(
         ("classifier", 0.0, 0.99),
     ],
 )
-def test_shipped_models_are_small_and_tell_unseen_drivers_apart(
+def test_shipped_models_are_small_and_classify_unseen_drivers(
     dataset: Path, name: str, noise_m: float, least: float
 ) -> None:
     assert find(name).with_suffix(".safetensors").stat().st_size < 2_000_000

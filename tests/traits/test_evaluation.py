@@ -37,7 +37,7 @@ def separable(street):
     return with_latents(windows, noise * [0.1, 100.0] + conservative[:, None] * [1.0, 0.0]), conservative
 
 
-def test_separable_latents_are_told_apart(model, separable):
+def test_separable_latents_are_classified(model, separable):
     result = evaluate(model, *separable)
     assert result.accuracy == 1.0
     assert result.windows == len(split_by_episode(separable[0], TEST_FRACTION, 0)[1])
@@ -91,7 +91,7 @@ def test_encoding_in_parts_changes_nothing(separable, monkeypatch):
 
 
 def test_the_neighbours_see_what_no_line_can(model, street):
-    """A ring around a cluster: no straight line tells them apart."""
+    """A ring around a cluster: no straight line separates them."""
     windows, conservative = street
     angle = np.linspace(0.0, 40.0, len(conservative))
     ring = np.stack((np.cos(angle), np.sin(angle)), axis=1)

@@ -110,13 +110,13 @@ def test_a_card_that_does_not_fit_the_weights_is_reported(saved, small):
 
 
 @pytest.mark.parametrize("settings", [{"depth": 3}, {"embedding_sizes": [-1]}, {"hidden_size": "many"}])
-def test_settings_nobody_can_use_are_reported(saved, settings):
+def test_unusable_settings_are_reported(saved, settings):
     add_directly(saved, {"settings": settings})
     with pytest.raises(InputError, match="settings"):
         load(saved)
 
 
-def test_the_card_tells_what_it_was_given_and_takes_additions(saved):
+def test_the_card_keeps_its_entries_and_takes_additions(saved):
     add_to_card(saved, {"accuracy": 0.99})
     card = read_card(saved)
     assert (card.method, card.latent_size, card.seed, card.entries["accuracy"]) == ("vae", 2, 4, 0.99)

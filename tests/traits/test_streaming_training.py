@@ -69,7 +69,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """What a user sees in a folder, apart from the log, which tells the time."""
+    """What a user sees in a folder, apart from the log, which has the time."""
     return {file.name: file.read_bytes() for file in folder.glob("[!.]*") if file.is_file()}
 
 
@@ -102,7 +102,7 @@ def test_an_interrupted_training_ends_with_the_very_same_model_wherever_its_wind
     assert files(tmp_path / "broken") == files(tmp_path / "whole")
 
 
-def test_the_command_keeps_windows_in_a_file_if_it_is_told_to(
+def test_the_command_keeps_windows_in_a_file_with_its_flag(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[Path] = []
@@ -130,8 +130,8 @@ def test_bad_requests_are_refused_before_the_dataset_is_read(tmp_path: Path) -> 
 
 def peak_mib(code: str, *arguments: object) -> float:
     """The most memory that a process took which ran some code."""
-    told = "print(next(line for line in open('/proc/self/status') if line.startswith('VmHWM')).split()[1])"
-    command = [sys.executable, "-c", f"{code}\n{told}", *map(str, arguments)]
+    peak = "print(next(line for line in open('/proc/self/status') if line.startswith('VmHWM')).split()[1])"
+    command = [sys.executable, "-c", f"{code}\n{peak}", *map(str, arguments)]
     ran = subprocess.run(command, capture_output=True, text=True, check=True)
     return float(ran.stdout.split()[-1]) / 1024
 

@@ -153,16 +153,16 @@ def test_bad_requests_leave_no_folder(windows, small, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_progress_is_told_in_windows_with_the_loss(windows, small, tmp_path):
-    told = []
-    train(windows, small, tmp_path, report=told.append)
+def test_progress_is_reported_in_windows_with_the_loss(windows, small, tmp_path):
+    reported = []
+    train(windows, small, tmp_path, report=reported.append)
     count = len(windows.length)
-    assert {(one.total, one.unit) for one in told} == {(small.epochs * count, "window")}
-    assert [one.done for one in told] == sorted({one.done for one in told})
-    assert (told[0].done, told[0].measures) == (0, {})
-    assert told[-1].done == small.epochs * count
+    assert {(progress.total, progress.unit) for progress in reported} == {(small.epochs * count, "window")}
+    assert [progress.done for progress in reported] == sorted({progress.done for progress in reported})
+    assert (reported[0].done, reported[0].measures) == (0, {})
+    assert reported[-1].done == small.epochs * count
     card = json.loads((tmp_path / "model.json").read_text())
-    assert told[-1].measures == {"loss": pytest.approx(card["loss"]["total"])}
+    assert reported[-1].measures == {"loss": pytest.approx(card["loss"]["total"])}
 
 
 def test_the_learning_rate_decays_linearly_to_zero(windows, small, tmp_path, monkeypatch):

@@ -88,8 +88,8 @@ def _timesteps(rows: pd.DataFrame, layout: Layout) -> Iterator[str]:
 
 
 def _vehicles(rows: pd.DataFrame, layout: Layout) -> list[str]:
-    """The element of each row."""
-    names = [one.name for one in layout.scene.routes]
+    """Return the element of each row."""
+    names = [route.name for route in layout.scene.routes]
     route = rows["route"].cat.set_categories(names).cat.codes.to_numpy(np.int64)
     front_m = rows["position_m"].to_numpy(np.float64)
     starts_m = layout.lane_start_m
@@ -119,7 +119,7 @@ def _vehicles(rows: pd.DataFrame, layout: Layout) -> list[str]:
 def _fronts(
     front_m: NDArray[np.float64], route: NDArray[np.integer], layout: Layout
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """x and y of front bumpers, and the vehicles' angles, clockwise from north in degrees; all (M,)."""
+    """Return x and y of front bumpers, and the angles, clockwise from north in degrees, of vehicles; all (M,)."""
     length_m, width_m = layout.scene.vehicle.length_m, layout.scene.vehicle.width_m
     boxes = new_boxes(len(front_m), length_m, width_m)
     for number, way in enumerate(layout.ways):
@@ -133,7 +133,7 @@ def _fronts(
 
 
 def _decimals(values: NDArray[np.float64]) -> NDArray[np.object_]:
-    """Texts of numbers, each different one formatted once."""
+    """Return numbers as texts; each different one is formatted once."""
     scale = 10**_DECIMALS
     different, index = np.unique(np.rint(values * scale).astype(np.int64), return_inverse=True)
     texts: NDArray[np.object_] = np.array([f"{value / scale:.{_DECIMALS}f}" for value in different], object)[index]
@@ -178,7 +178,7 @@ def _read_table(file: Path, columns: FcdColumns) -> pd.DataFrame:
             texts = dict.fromkeys(ids, str)
             rows = pd.read_csv(raw, sep=";", usecols=list(names), dtype=texts, compression=packing)
     rows = rows.rename(columns=names)[list(names.values())]
-    rows = rows[rows["vehicle"].notna()]  # an empty timestep is a row of its own
+    rows = rows[rows["vehicle"].notna()]  # an empty timestep has a row, too
     kinds = {name: "category" if name in ids.values() else "float64" for name in names.values()}
     rows = rows.astype(kinds).reset_index(drop=True)
     for name in ids.values():

@@ -90,7 +90,7 @@ class TraitStatistics:
     def summary(self) -> dict[str, Any]:
         """Return the counts, and the summaries of the distributions, by the names of the fields."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: one.summary() if isinstance(one, Distribution) else one for name, one in values.items()}
+        return {name: value.summary() if isinstance(value, Distribution) else value for name, value in values.items()}
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Inspection:
         """Return manifest and summaries as JSON can hold them."""
         return {
             "manifest": self.manifest.content(),
-            "traits": {trait: one.summary() for trait, one in self.traits.items()},
+            "traits": {trait: statistics.summary() for trait, statistics in self.traits.items()},
             "episode_s": self.episode_s.summary(),
             "drivers_per_episode": self.drivers_per_episode.summary(),
         }
@@ -127,7 +127,7 @@ def inspect(folder: Path, progress: bool = True) -> Inspection:
         episodes = rows.groupby("episode")
         episode_s += Distribution.of(episodes["time_s"].max())
         drivers_per_episode += Distribution.of(episodes["vehicle"].nunique())
-    found = sum(one.rows for one in traits.values())
+    found = sum(statistics.rows for statistics in traits.values())
     if found != manifest.rows:
         raise InputError(
             f"{folder} has {found} of {manifest.rows} rows with their drivers; "
@@ -178,20 +178,22 @@ def report(inspection: Inspection) -> str:
         "episode (s)": inspection.episode_s,
         **{
             f"{trait}, {name}": distribution
-            for trait, one in inspection.traits.items()
+            for trait, statistics in inspection.traits.items()
             for name, distribution in (
-                ("speed (m/s)", one.speed_mps),
-                ("gap to the leader (m)", one.gap_m),
-                ("time on the street (s)", one.track_s),
+                ("speed (m/s)", statistics.speed_mps),
+                ("gap to the leader (m)", statistics.gap_m),
+                ("time on the street (s)", statistics.track_s),
             )
         },
     }
-    summaries = pd.DataFrame.from_dict({name: one.summary() for name, one in table.items()}, orient="index")
+    summaries = pd.DataFrame.from_dict(
+        {name: distribution.summary() for name, distribution in table.items()}, orient="index"
+    )
     return "\n".join([*lines, "", summaries.to_string(na_rep="")])
 
 
 def _printed(value: object) -> str:
-    return ", ".join(f"{key} {one}" for key, one in value.items()) if isinstance(value, Mapping) else str(value)
+    return ", ".join(f"{key} {part}" for key, part in value.items()) if isinstance(value, Mapping) else str(value)
 
 
 def plot(inspection: Inspection, file: Path) -> None:
@@ -208,14 +210,14 @@ def plot(inspection: Inspection, file: Path) -> None:
 def _boxes(inspection: Inspection) -> Figure:
     """Return a figure with a row per vType that has drivers: median, middle half, and where 90 % of the values lie."""
     by_drivers = sorted(inspection.traits.items(), key=lambda pair: -pair[1].drivers)
-    shown = [(vtype, one) for vtype, one in by_drivers if one.drivers][:_MOST_ROWS]
+    shown = [(vtype, statistics) for vtype, statistics in by_drivers if statistics.drivers][:_MOST_ROWS]
     figure = Figure(figsize=(12.0, 1.8 + 0.42 * max(len(shown), 1)), dpi=150, layout="constrained")
     speed, gap, track = figure.subplots(1, 3, sharey=True)
-    for row, (_, one) in enumerate(shown):
-        for axes, distribution in ((speed, one.speed_mps), (gap, one.gap_m), (track, one.track_s)):
+    for row, (_, statistics) in enumerate(shown):
+        for axes, distribution in ((speed, statistics.speed_mps), (gap, statistics.gap_m), (track, statistics.track_s)):
             _draw_box(axes, distribution, row)
     speed.set(xlabel="speed (m/s)", ylim=(len(shown) - 0.5, -0.5))
-    speed.set_yticks(range(len(shown)), [f"{vtype} ({one.drivers:,} drivers)" for vtype, one in shown])
+    speed.set_yticks(range(len(shown)), [f"{vtype} ({statistics.drivers:,} drivers)" for vtype, statistics in shown])
     gap.set(xlabel="gap to the leader, if there is one (m)")
     track.set(xlabel="time on the street (s)")
     for axes in (speed, gap, track):
@@ -251,10 +253,10 @@ def _histograms(inspection: Inspection) -> Figure:
     speed, gap, track = figure.subplots(1, 3)
     colours = _colours(inspection.manifest)
     for trait, colour in colours.items():
-        one = inspection.traits[trait]
-        _draw(speed, one.speed_mps, colour, width=0.02)
-        _draw(gap, one.gap_m, colour, width=0.1)
-        _draw(track, one.track_s, colour, width=0.5)
+        statistics = inspection.traits[trait]
+        _draw(speed, statistics.speed_mps, colour, width=0.02)
+        _draw(gap, statistics.gap_m, colour, width=0.1)
+        _draw(track, statistics.track_s, colour, width=0.5)
     speed.set(xlabel="speed (m/s)", ylabel="steps")
     gap.set(xlabel="gap to the leader, if there is one (m)", xlim=(0, None))
     track.set(xlabel="time on the street (s)", ylabel="drivers", xlim=(0, None))

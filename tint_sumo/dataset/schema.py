@@ -1,8 +1,8 @@
-"""What a recorded dataset holds, and how it lies on disk.
+"""Tables and files of a recorded dataset.
 
 A dataset folder has ``trajectories/`` (one row per vehicle and step) and, apart from it, ``drivers/`` (one row per
 driver, with the trait label), each one Parquet file per shard, and ``manifest.json``, written last. ``fcd/``, if asked
-for, tells the trajectories once more, as SUMO does.
+for, has the trajectories as SUMO writes them.
 """
 
 import hashlib
@@ -136,7 +136,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def shard_path(part: str, shard: int) -> str:
-    """A shard's file, relative to the dataset's folder."""
+    """Return a shard's file, relative to the dataset's folder."""
     return f"{part}/shard-{shard:05d}.{_SUFFIX[part]}"
 
 
@@ -145,17 +145,17 @@ def shard_file(folder: Path, part: str, shard: int) -> Path:
 
 
 def shard_number(file: PurePath) -> int:
-    """Of a path made by ``shard_file``."""
+    """Return the number of the shard in a path made by ``shard_file``."""
     return int(file.name.removeprefix("shard-").split(".")[0])
 
 
 def read_shards(
     folder: Path, part: str, manifest: Manifest, columns: list[str] | None = None
 ) -> Iterator[pd.DataFrame]:
-    """The rows of a dataset's table, shard after shard.
+    """Yield the rows of a dataset's table, shard after shard.
 
     Raises:
-        InputError: a file is missing or damaged, or there are more or fewer rows than the manifest tells of.
+        InputError: a file is missing or damaged, or there are more or fewer rows than in the manifest.
     """
     found, wanted = 0, manifest.rows if part == TRAJECTORIES else manifest.drivers
     for shard in range(manifest.shards):
@@ -167,7 +167,7 @@ def read_shards(
 
 
 def read_shard(file: Path, columns: list[str] | None = None) -> pd.DataFrame:
-    """The rows of one Parquet file.
+    """Return the rows of one Parquet file.
 
     Raises:
         InputError: the file is missing or damaged.
@@ -214,7 +214,7 @@ def verify(folder: Path, manifest: Manifest) -> int:
 
 
 def read_shard_metadata(file: Path) -> pq.FileMetaData:
-    """Number of rows and the file's own key-value metadata.
+    """Return the number of rows and the file's key-value metadata.
 
     Raises:
         InputError: the file is missing or damaged.
@@ -241,14 +241,14 @@ def require_table(file: Path, what: str) -> None:
 @contextmanager
 def _mendable(file: Path) -> Iterator[None]:
     try:
-        for one in file.glob("shard-*.parquet") if file.is_dir() else [file] if file.exists() else []:
-            require_table(one, "shard of a dataset")
+        for shard in file.glob("shard-*.parquet") if file.is_dir() else [file] if file.exists() else []:
+            require_table(shard, "shard of a dataset")
         yield
     except InputError:
         raise
     except FileNotFoundError:
         raise InputError(f"{file} is missing; repeat the command that recorded the dataset") from None
-    except (OSError, ValueError, KeyError) as error:  # pyarrow's own errors derive from these
+    except (OSError, ValueError, KeyError) as error:  # pyarrow's errors derive from these
         reason = str(error).splitlines()[0]
         raise InputError(
             f"{file} is damaged ({reason}); remove it and repeat the command that recorded the dataset"

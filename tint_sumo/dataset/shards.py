@@ -53,7 +53,7 @@ _FLOATS = [field.name for field in (*TRAJECTORY_SCHEMA, *DRIVER_SCHEMA) if pa.ty
 
 
 class ShardContents(NamedTuple):
-    """What is in a shard."""
+    """Counts of what a shard contains."""
 
     windows: int
     rows: int
@@ -83,7 +83,7 @@ def record_dataset(
     Args:
         out: a new folder, or the one of this very recording, or its URL: shards then go there from where they are
             recorded.
-        settings: what the dataset follows from; ``windows`` tells how many windows are enough.
+        settings: what the dataset follows from; ``windows`` of them are enough.
         shards: records a shard by its number, as far as it is not there already.
         episodes_per_shard, episode_s: what a shard consists of.
         workers: processes that simulate, or an executor.
@@ -165,7 +165,7 @@ class _Stored:
 
 
 def _remove_shards_from(store: Store, first: int) -> None:
-    """Workers run ahead: drop what they recorded beyond the last shard needed."""
+    """Drop what workers, which run ahead, recorded beyond the last shard needed."""
     for part in (*TABLES, FCD):
         for path in store.files(part):
             if shard_number(PurePosixPath(path)) >= first:
@@ -173,20 +173,20 @@ def _remove_shards_from(store: Store, first: int) -> None:
 
 
 def _contents(shards: Sequence[ShardContents]) -> dict[str, Any]:
-    """What a manifest tells of the shards."""
+    """Return a manifest's entries about the shards."""
     return {
-        "windows": sum(one.windows for one in shards),
+        "windows": sum(shard.windows for shard in shards),
         "window_steps": WINDOW_STEPS,
         "no_leader_gap_m": NO_LEADER_GAP_M,
-        "rows": sum(one.rows for one in shards),
-        "drivers": sum(one.drivers for one in shards),
+        "rows": sum(shard.rows for shard in shards),
+        "drivers": sum(shard.drivers for shard in shards),
         "shards": len(shards),
         "versions": versions(("tint_sumo", "libsumo", "numpy", "pandas", "pyarrow")),
     }
 
 
 def _checksums(store: Store, shards: int) -> dict[str, str]:
-    """Checksums of all tables' files, by their paths in the dataset's folder."""
+    """Return the checksums of all tables' files, by their paths in the dataset's folder."""
     paths = [shard_path(table, shard) for table in TABLES for shard in range(shards)]
     return {path: hashlib.sha256(store.read(path)).hexdigest() for path in paths}
 
@@ -196,7 +196,7 @@ def has_tables(out: Path, shard: int) -> bool:
 
 
 def shard_contents(out: Path, shard: int) -> ShardContents:
-    """What is in a shard, as its files tell."""
+    """Return the counts of a shard, as its files have them."""
     trajectories, drivers = (read_shard_metadata(shard_file(out, table, shard)) for table in TABLES)
     return ShardContents(int(trajectories.metadata[_WINDOWS_KEY]), trajectories.num_rows, drivers.num_rows)
 

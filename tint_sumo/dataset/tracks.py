@@ -29,7 +29,11 @@ class Lanes:
 
     @classmethod
     def read(cls, net_file: Path) -> Self:
-        """Raises InputError if there is no such file or it is not a SUMO network."""
+        """Read a SUMO network.
+
+        Raises:
+            InputError: there is no such file, or it is not a SUMO network.
+        """
         net = read_net(net_file)
         lanes = [lane for edge in net.getEdges() for lane in edge.getLanes()]
         if not lanes:
@@ -39,7 +43,7 @@ class Lanes:
         return cls(names, length_m, names.get_indexer(pd.Index([_successor(lane) for lane in lanes])))
 
     def numbers(self, names: pd.Index) -> NDArray[np.int64]:
-        """Of lanes by their ids.
+        """Return the numbers of lanes with these ids.
 
         Raises:
             InputError: the network has no such lane.
@@ -56,14 +60,14 @@ def _successor(lane: Any) -> str:
 
 
 def gaps_m(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None = None) -> NDArray[np.float64]:
-    """Gap (M,) from each vehicle's front to the back of the next one ahead at that time; NaN if none is seen.
+    """Return the gap (M,) from each vehicle's front to the back of the next vehicle at that time; NaN if none is seen.
 
-    A leader is seen on the vehicle's own lane and, if ``lanes`` are given, on those that follow it without a choice and
+    A leader is seen on the vehicle's lane and, if ``lanes`` are given, on those that follow it without a choice and
     begin so near that the gap can be less than ``NO_LEADER_GAP_M``.
 
     Args:
         rows: columns time_s, lane and pos_m as ``tint_sumo.dataset.fcd.read_fcd`` gives them.
-        vehicle_length_m: of all vehicles; floating-car data do not tell it.
+        vehicle_length_m: of all vehicles; floating-car data do not contain it.
         lanes: of the network.
 
     Raises:
@@ -73,9 +77,9 @@ def gaps_m(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None = No
     number = np.arange(len(names)) if lanes is None else lanes.numbers(rows["lane"].cat.categories)
     lane, pos_m = number[rows["lane"].cat.codes], rows["pos_m"].to_numpy()
     when = np.unique(rows["time_s"], return_inverse=True)[1] * len(names)
-    place = when + lane
-    order = np.lexsort((pos_m, place))
-    queue, queue_m = place[order], pos_m[order]  # each lane at each time, from the rearmost vehicle to the first
+    lane_then = when + lane
+    order = np.lexsort((pos_m, lane_then))
+    queue, queue_m = lane_then[order], pos_m[order]  # each lane at each time, from the rearmost vehicle to the first
 
     distance_m = np.full(len(rows), np.nan)
     distance_m[order[:-1]] = np.where(queue[1:] == queue[:-1], np.diff(queue_m), np.nan)
@@ -97,7 +101,7 @@ def gaps_m(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None = No
 def read_tracks(
     source: Path, *, net_file: Path | None = None, vehicle_length_m: float = VehicleShape().length_m
 ) -> pd.DataFrame:
-    """Rows of tracks, sorted by track and time, at steps of 0.1 s.
+    """Return rows of tracks, sorted by track and time, at steps of 0.1 s.
 
     Data in other steps, up to 1 s, are interpolated linearly. A vehicle that is missing for a step starts a new track.
 
@@ -126,7 +130,7 @@ def read_tracks(
 
 
 def _trajectories_in(source: Path) -> Path | None:
-    """The Parquet file or folder of files with this project's trajectories; None if it must be floating-car data."""
+    """Return the Parquet file or folder with this project's trajectories; None if it must be floating-car data."""
     if source.is_dir():
         folder = source / TRAJECTORIES if (source / TRAJECTORIES).is_dir() else source
         if not any(folder.glob("shard-*.parquet")):
@@ -138,12 +142,13 @@ def _trajectories_in(source: Path) -> Path | None:
 
 
 def _recorded(source: Path) -> pd.DataFrame:
-    """Columns vehicle, time_s, position_m and gap_m, by vehicle and time."""
+    """Return columns vehicle, time_s, position_m and gap_m, by vehicle and time."""
     rows = read_shard(source, list(_RECORDED_COLUMNS))
     number, vehicles = pd.MultiIndex.from_frame(rows[["episode", "vehicle"]]).factorize()
+    ids = [f"{episode}.{vehicle}" for episode, vehicle in vehicles]
     return pd.DataFrame(
         {
-            "vehicle": pd.Categorical.from_codes(number, pd.Index([f"{one}.{other}" for one, other in vehicles])),
+            "vehicle": pd.Categorical.from_codes(number, pd.Index(ids)),
             "time_s": rows["episode"] * EPISODE_PERIOD_S + rows["time_s"].astype(float).round(3),
             "position_m": rows["position_m"].astype(float),
             "gap_m": rows["gap_m"].astype(float),
@@ -152,9 +157,9 @@ def _recorded(source: Path) -> pd.DataFrame:
 
 
 def _driven(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None) -> pd.DataFrame:
-    """Columns vehicle, time_s, position_m and gap_m, by vehicle and time.
+    """Return columns vehicle, time_s, position_m and gap_m, by vehicle and time.
 
-    Speeds are the finer measure of displacements: rounded to 0.01 m/s they tell those of 0.1 s to the millimetre, and
+    Speeds are the finer measure of displacements: rounded to 0.01 m/s they give those of 0.1 s to the millimetre, and
     SUMO's displacements are speed times step. Positions on one lane correct them beyond a position's last digit.
     """
     rows = rows.assign(gap_m=gaps_m(rows, vehicle_length_m, lanes))
@@ -169,7 +174,7 @@ def _driven(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None) ->
 
 
 def _in_steps(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
-    """Columns vehicle, track, time_s, position_m and gap_m at steps of 0.1 s, of rows by vehicle and time."""
+    """Return columns vehicle, track, time_s, position_m and gap_m at steps of 0.1 s, of rows by vehicle and time."""
     interval_s = rows["time_s"].diff().to_numpy()[1:]
     same = (rows["vehicle"].cat.codes.diff() == 0).to_numpy()[1:]
     step_s = _step_s(interval_s[same], source)
@@ -192,7 +197,7 @@ def _in_steps(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
 
 
 def _step_s(interval_s: NDArray[np.float64], source: Path) -> float:
-    """The usual time between two rows of a vehicle, from all such times."""
+    """Return the usual time between two rows of a vehicle, from all such times."""
     if not len(interval_s):
         raise InputError(f"{source} has no vehicle for two timesteps; write a longer run")
     if (interval_s <= 0.0).any():

@@ -26,7 +26,7 @@ PART = 10_000  # windows that are worked on at a time
 
 @dataclass(frozen=True)
 class Windows:
-    """N windows of the states x of paper III-B, those of a driver in a row; nothing in them tells the label.
+    """N windows of the states x of paper III-B, those of a driver in a row; nothing in them gives the label away.
 
     A state is the offset from the window's first position and the gap to the leader, in m; zero after ``length``.
     """
@@ -41,17 +41,17 @@ class Windows:
         return len(self.length)
 
     def __getitem__(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> Self:
-        """The windows at these indices."""
+        """Return the windows at these indices."""
         return type(self)(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
     def parts(self) -> Iterator[Self]:
-        """All windows in their order, some thousands at a time."""
+        """Yield all windows in their order, some thousands at a time."""
         for start in range(0, len(self), PART):
             yield self[start : start + PART]
 
 
-class OfDrivers(Protocol):
-    """What tells the driver of each of N windows."""
+class HasDriver(Protocol):
+    """N windows with the numbers of their drivers."""
 
     @property
     def driver(self) -> NDArray[np.int64]:
@@ -59,7 +59,7 @@ class OfDrivers(Protocol):
 
 
 def load_windows(folder: Path) -> Windows:
-    """All windows of a dataset: every recorded track is cut into windows of 20 steps, and a remainder of at least 2.
+    """Return all windows of a dataset; its tracks are cut into windows of 20 steps, and a remainder of at least 2.
 
     Raises:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
@@ -81,7 +81,7 @@ def load_windows(folder: Path) -> Windows:
 
 
 def read_windows(folder: Path) -> Iterator[Windows]:
-    """The windows of a dataset, shard after shard; all windows of an episode are in one shard.
+    """Yield the windows of a dataset, shard after shard; all windows of an episode are in one shard.
 
     Raises:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
@@ -101,7 +101,7 @@ def read_windows(folder: Path) -> Iterator[Windows]:
 
 
 def read_training_windows(folder: Path, test_fraction: float, seed: int) -> Iterator[Windows]:
-    """The training windows of ``split_by_episode``, shard after shard.
+    """Yield the training windows of ``split_by_episode``, shard after shard.
 
     Raises:
         InputError: as ``read_windows``.
@@ -153,25 +153,25 @@ def valid_steps(length: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def capped(gap_m: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return gaps to leaders, NaN without one, as trait models are given them: 20 m at most, and 20 m without one."""
+    """Return gaps to leaders, NaN without one, as trait models read them: 20 m at most, and 20 m without one."""
     return np.asarray(np.fmin(gap_m, NO_LEADER_GAP_M))
 
 
 def joined(parts: Sequence[Windows]) -> Windows:
-    """All windows of several datasets, whose drivers and episodes are told apart."""
+    """Return all windows of several datasets, with different numbers for their drivers and episodes."""
     first = np.cumsum([0, *(part.episode.max(initial=0) + 1 for part in parts)])
     moved = [
         replace(part, driver=part.driver + start * _DRIVERS_PER_EPISODE, episode=part.episode + start)
         for part, start in zip(parts, first.tolist(), strict=False)
     ]
-    columns = {field.name: np.concatenate([getattr(one, field.name) for one in moved]) for field in fields(Windows)}
+    columns = {field.name: np.concatenate([getattr(part, field.name) for part in moved]) for field in fields(Windows)}
     return Windows(**columns)
 
 
-def load_labels(folder: Path, windows: OfDrivers) -> NDArray[np.int64]:
-    """Number of each window's driver's profile in its population; (N,). Never an input of a method without labels.
+def load_labels(folder: Path, windows: HasDriver) -> NDArray[np.int64]:
+    """Return the number of each window's trait in ``Manifest.traits``, (N,).
 
-    In a dataset of one's own SUMO configuration: numbers of the drivers' vTypes in their sorted order.
+    Methods without labels never see it.
 
     Raises:
         InputError: the labels are missing or do not belong to these windows.
@@ -181,8 +181,8 @@ def load_labels(folder: Path, windows: OfDrivers) -> NDArray[np.int64]:
     return pd.Index(traits).get_indexer(pd.Index(drivers["trait"].astype(str))).astype(np.int64)[row]
 
 
-def load_drivers(folder: Path, windows: OfDrivers, columns: Sequence[str]) -> pd.DataFrame:
-    """Columns of the label file, such as ``desired_speed_mps``, a row for each window's driver.
+def load_drivers(folder: Path, windows: HasDriver, columns: Sequence[str]) -> pd.DataFrame:
+    """Return columns of the label file, such as ``desired_speed_mps``, with a row for each window's driver.
 
     Raises:
         InputError: the labels are missing or do not belong to these windows.
@@ -191,8 +191,8 @@ def load_drivers(folder: Path, windows: OfDrivers, columns: Sequence[str]) -> pd
     return drivers.iloc[row].reset_index(drop=True)
 
 
-def _drivers(folder: Path, windows: OfDrivers, columns: Sequence[str]) -> tuple[pd.DataFrame, NDArray[np.intp]]:
-    """Columns of the label file, a row for each driver, and the row of each window's driver."""
+def _drivers(folder: Path, windows: HasDriver, columns: Sequence[str]) -> tuple[pd.DataFrame, NDArray[np.intp]]:
+    """Return columns of the label file, with a row for each driver, and the row of each window's driver."""
     rows = pd.concat(read_shards(folder, DRIVERS, read_manifest(folder), ["episode", "vehicle", *columns]))
     row = pd.Index(_driver_numbers(rows)).get_indexer(pd.Index(windows.driver))
     if (row < 0).any():
@@ -201,13 +201,13 @@ def _drivers(folder: Path, windows: OfDrivers, columns: Sequence[str]) -> tuple[
 
 
 def split_by_episode(windows: Windows, test_fraction: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices of training and test windows; no episode, hence no driver, stands on both sides."""
+    """Return indices of training and test windows; no episode, hence no driver, is in both."""
     in_test = np.isin(windows.episode, episodes_to_test(windows.episode, test_fraction, seed))
     return np.flatnonzero(~in_test), np.flatnonzero(in_test)
 
 
 def episodes_to_test(episode: NDArray[np.int64], test_fraction: float, seed: int) -> NDArray[np.int64]:
-    """Which of these episodes, each named once or more often, are for tests."""
+    """Return the episodes for tests among these, each named once or more often."""
     episodes = np.unique(episode)
     return np.random.default_rng(seed).permutation(episodes)[: round(test_fraction * len(episodes))]
 
@@ -243,11 +243,11 @@ class WindowFile:
         return self._count
 
     def __getitem__(self, index: NDArray[np.integer]) -> Windows:
-        """The windows at these indices."""
-        return _windows(b"".join([self._read(one, 1) for one in index.tolist()]))
+        """Return the windows at these indices."""
+        return _windows(b"".join([self._read(number, 1) for number in index.tolist()]))
 
     def parts(self) -> Iterator[Windows]:
-        """All windows in their order, some thousands at a time."""
+        """Yield all windows in their order, some thousands at a time."""
         for start in range(0, len(self), PART):
             yield _windows(self._read(start, PART))
 
@@ -262,7 +262,7 @@ class WindowFile:
 
 @contextmanager
 def window_file(parts: Iterable[Windows], folder: Path) -> Iterator[WindowFile]:
-    """All windows of ``parts`` in a file without a name, which is gone after the block, and whenever the process ends.
+    """Write all windows of ``parts`` to a file without a name, which is gone after the block or when the process ends.
 
     Args:
         parts: windows, which are written in their order.
@@ -271,7 +271,7 @@ def window_file(parts: Iterable[Windows], folder: Path) -> Iterator[WindowFile]:
     Raises:
         InputError: there is not enough room.
     """
-    home = next(one for one in (folder, *folder.absolute().parents) if one.is_dir())
+    home = next(nearest for nearest in (folder, *folder.absolute().parents) if nearest.is_dir())
     with TemporaryFile(dir=home, buffering=0) as file:
         for part in parts:
             left = memoryview(_content(part))

@@ -47,7 +47,7 @@ class SequenceBuffer(RolloutBuffer):
             )
 
     def _flat(self, values: np.ndarray, envs: np.ndarray) -> Tensor:
-        """Steps x environments x ... to the flat tensor of some environments."""
+        """Return the flat tensor of some environments from steps x environments x ..."""
         return self.to_torch(values[:, envs].reshape(-1, *values.shape[2:]), copy=False)
 
     def _observations(self, envs: np.ndarray) -> PyTorchObs:
@@ -66,5 +66,5 @@ class DictSequenceBuffer(DictRolloutBuffer, SequenceBuffer):
 
 
 def buffer_class(observation_space: spaces.Space[Any]) -> type[SequenceBuffer]:
-    """The buffer for an observation space."""
+    """Return the buffer class for an observation space."""
     return DictSequenceBuffer if isinstance(observation_space, spaces.Dict) else SequenceBuffer

@@ -97,10 +97,10 @@ class _Recurrence(torch.autograd.Function):
 
 
 def _tanh_slope(outer: Tensor, output: Tensor) -> Tensor:
-    """``outer`` times the derivative of tanh where it gives ``output``, in one pass."""
+    """Return ``outer`` times the derivative of tanh where it gives ``output``, in one pass."""
     return cast(Tensor, torch.ops.aten.tanh_backward(outer, output))
 
 
 def _sigmoid_slope(outer: Tensor, output: Tensor) -> Tensor:
-    """``outer`` times the derivative of the logistic function where it gives ``output``, in one pass."""
+    """Return ``outer`` times the derivative of the logistic function where it gives ``output``, in one pass."""
     return cast(Tensor, torch.ops.aten.sigmoid_backward(outer, output))

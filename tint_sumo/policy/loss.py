@@ -31,7 +31,7 @@ class PpoLoss:
 
 
 def ppo_loss(decisions: Decisions, *, clip_range: float, ent_coef: float, vf_coef: float) -> PpoLoss:
-    """The loss of some decisions.
+    """Return the loss of some decisions.
 
     Args:
         decisions: at least one.

@@ -1,6 +1,5 @@
 """The paper's policy network (III-C): attention over vehicles, a recurrent layer, an actor and a critic."""
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,17 +15,10 @@ from tint_sumo.config import PolicySettings
 from tint_sumo.core.errors import InputError, NotFiniteError
 from tint_sumo.policy.gru import ResetGru
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
+from tint_sumo.traits.encoder import perceptron
 
 OBSERVATION_KEYS = frozenset({"ego", "vehicles", "mask", TRAITS})
 _FAR_BELOW = -1e9  # score of an empty slot; finite, so that a street without vehicles gives no NaN
-
-
-def _mlp(*sizes: int) -> nn.Sequential:
-    """Linear layers between ``sizes``, each followed by ReLU."""
-    layers: list[nn.Module] = []
-    for inputs, outputs in pairwise(sizes):
-        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
-    return nn.Sequential(*layers)
 
 
 class AttentionExtractor(BaseFeaturesExtractor):
@@ -65,17 +57,17 @@ class AttentionExtractor(BaseFeaturesExtractor):
         ego_size, position_size, trait_size = (_last_axis(observation_space, k) for k in ("ego", "vehicles", "traits"))
         embedded = settings.embedding_sizes[-1]
         self.position_gain = settings.position_gain
-        self.embed = _mlp(position_size + trait_size + ego_size, *settings.embedding_sizes)
+        self.embed = perceptron(position_size + trait_size + ego_size, *settings.embedding_sizes)
         self.score = (
-            nn.Sequential(*_mlp(2 * embedded, *settings.score_sizes), nn.Linear(settings.score_sizes[-1], 1))
+            nn.Sequential(*perceptron(2 * embedded, *settings.score_sizes), nn.Linear(settings.score_sizes[-1], 1))
             if settings.attention
             else None
         )
-        self.context = _mlp(embedded, settings.context_size)
-        self.joint = _mlp(settings.context_size + ego_size, *settings.joint_sizes)
+        self.context = perceptron(embedded, settings.context_size)
+        self.joint = perceptron(settings.context_size + ego_size, *settings.joint_sizes)
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
-        """Features (B, features_dim) of B observations."""
+        """Return features (B, features_dim) of B observations."""
         ego = self._gained_ego(observations)
         slots, rows, embedded = self._embed_vehicles(observations)
         weights = self._weights(observations["mask"], slots, rows, embedded)
@@ -85,7 +77,7 @@ class AttentionExtractor(BaseFeaturesExtractor):
         return features
 
     def attention(self, observations: dict[str, Tensor]) -> Tensor:
-        """Attention weights (B, V): they sum to 1 over the vehicles and are 0 in empty slots."""
+        """Return attention weights (B, V), which sum to 1 over the vehicles and are 0 in empty slots."""
         return self._weights(observations["mask"], *self._embed_vehicles(observations))
 
     def _gained_ego(self, observations: dict[str, Tensor]) -> Tensor:
@@ -93,7 +85,7 @@ class AttentionExtractor(BaseFeaturesExtractor):
         return torch.cat([position * self.position_gain, velocity], dim=-1)
 
     def _embed_vehicles(self, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """The R real vehicles of a batch: flat slot index (R,), batch index (R,), embedding (R, embedded)."""
+        """Return the R vehicles of a batch: flat slot index (R,), batch index (R,), embedding (R, embedded)."""
         rows, columns = _real(observations["mask"]).nonzero(as_tuple=True)
         slots = rows * observations["mask"].shape[-1] + columns
         positions = observations["vehicles"].flatten(0, 1).index_select(0, slots) * self.position_gain
@@ -112,19 +104,19 @@ class AttentionExtractor(BaseFeaturesExtractor):
         return torch.softmax(dense.view_as(mask), dim=-1) * real
 
     def _scores(self, embedded: Tensor, mean: Tensor, rows: Tensor) -> Tensor:
-        """The score network on [e_i, mean], (R, 1); its first layer meets each mean once, not once a vehicle."""
+        """Return scores (R, 1) from [e_i, mean]; the first layer meets each mean once, not once a vehicle."""
         assert self.score is not None
         first = self.score[0]
         assert isinstance(first, nn.Linear)
         size = embedded.shape[-1]
-        own = nn.functional.linear(embedded, first.weight[:, :size], first.bias)
+        per_vehicle = nn.functional.linear(embedded, first.weight[:, :size], first.bias)
         shared = nn.functional.linear(mean.to(embedded.dtype), first.weight[:, size:])
-        scores: Tensor = self.score[1:](own + shared.index_select(0, rows))
+        scores: Tensor = self.score[1:](per_vehicle + shared.index_select(0, rows))
         return scores
 
 
 def _with_true_traits(parts: dict[str, Any]) -> dict[str, Any]:
-    """Observations, or their spaces, with the true traits in place of the inferred ones."""
+    """Return observations, or their spaces, with the true traits in place of the inferred ones."""
     return {**{key: part for key, part in parts.items() if key != TRUE_TRAITS}, TRAITS: parts[TRUE_TRAITS]}
 
 
@@ -139,7 +131,7 @@ def _real(mask: Tensor) -> Tensor:
 
 
 def _sum_by_row(values: Tensor, rows: Tensor, count: int) -> Tensor:
-    """Sum (R, F) values of one row each, (count, F)."""
+    """Return the sums (count, F) of values (R, F) of one row each."""
     return values.new_zeros(count, values.shape[-1]).index_add(0, rows, values)
 
 
@@ -148,8 +140,8 @@ class GruPolicy(ActorCriticPolicy):
 
     Tensors of sequences are flat, (T * N, ...) with all N sequences of the first step first.
 
-    Where observations hold "true_traits", only the critic sees them: an attention network of its own, with the true
-    traits in place of the inferred ones, adds to what the GRU tells the critic (asymmetric actor-critic, Pinto et al.
+    Where observations hold "true_traits", only the critic sees them: a second attention network, with the true
+    traits in place of the inferred ones, adds to the critic's input from the GRU (asymmetric actor-critic, Pinto et al.
     2018). The actor, and so ``predict``, needs no such observation.
 
     Args:
@@ -209,18 +201,18 @@ class GruPolicy(ActorCriticPolicy):
         super()._build_mlp_extractor()
 
     def initial_states(self, count: int) -> Tensor:
-        """Hidden states at the start of ``count`` episodes, (count, hidden_size)."""
+        """Return hidden states at the start of ``count`` episodes, (count, hidden_size)."""
         return torch.zeros(count, self.settings.hidden_size, device=self.device)
 
     def _run(self, obs: PyTorchObs, states: Tensor, episode_starts: Tensor) -> tuple[Tensor, Tensor]:
-        """GRU outputs (T * N, hidden_size) and last states (N, hidden_size); ``episode_starts`` is (T, N)."""
+        """Return GRU outputs (T * N, hidden_size) and last states (N, hidden_size); ``episode_starts`` is (T, N)."""
         features = self.extract_features(obs)
         assert isinstance(features, Tensor)
         outputs, states = self.gru(features.view(*episode_starts.shape, -1), states, episode_starts)
         return outputs.flatten(0, 1), states
 
     def _latent_critic(self, obs: PyTorchObs, outputs: Tensor) -> Tensor:
-        """The critic's last hidden layer, from observations and the GRU's outputs there."""
+        """Return the critic's last hidden layer, from observations and the GRU's outputs there."""
         if self.critic_extractor is not None:
             assert isinstance(obs, dict)
             outputs = outputs + self.critic_hint(self.critic_extractor(_with_true_traits(obs)))
@@ -258,7 +250,7 @@ class GruPolicy(ActorCriticPolicy):
     def evaluate_actions(  # type: ignore[override]
         self, obs: PyTorchObs, actions: Tensor, states: Tensor, episode_starts: Tensor
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Values (T * N, 1), log-probabilities (T * N,) and entropies of N sequences of T steps.
+        """Return values (T * N, 1), log-probabilities (T * N,) and entropies of N sequences of T steps.
 
         Args:
             obs: T * N observations.
@@ -274,7 +266,7 @@ class GruPolicy(ActorCriticPolicy):
         return self.value_net(latent_critic.float()), distribution.log_prob(actions), distribution.entropy()
 
     def predict_values(self, obs: PyTorchObs, states: Tensor, episode_starts: Tensor) -> Tensor:  # type: ignore[override]
-        """Values (N, 1) of N observations; arguments as in ``forward``."""
+        """Return values (N, 1) of N observations; arguments as in ``forward``."""
         with self._autocast():
             outputs, _ = self._run(obs, states, episode_starts.unsqueeze(0))
             latent = self._latent_critic(obs, outputs)
@@ -284,14 +276,14 @@ class GruPolicy(ActorCriticPolicy):
     def get_distribution(  # type: ignore[override]
         self, obs: PyTorchObs, states: Tensor, episode_starts: Tensor
     ) -> tuple[Distribution, Tensor]:
-        """Action distribution and new states of N observations; arguments as in ``forward``."""
+        """Return the action distribution and new states of N observations; arguments as in ``forward``."""
         with self._autocast():
             outputs, states = self._run(obs, states, episode_starts.unsqueeze(0))
             latent = self.mlp_extractor.forward_actor(outputs)
         return self._finite_distribution(latent), states
 
     def _finite_distribution(self, latent_actor: Tensor) -> Distribution:
-        """The distribution of actions from the actor's last hidden layer.
+        """Return the distribution of actions from the actor's last hidden layer.
 
         Raises:
             FloatingPointError: that, or what the distribution is made of, is not finite.
@@ -314,7 +306,7 @@ class GruPolicy(ActorCriticPolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        """Actions for one observation or a batch, as Stable-Baselines3 users know it.
+        """Return actions for one observation or a batch, as Stable-Baselines3's policies do.
 
         Args:
             observation: of one environment or of N.
@@ -344,7 +336,7 @@ class GruPolicy(ActorCriticPolicy):
 
     @torch.no_grad()
     def attention_weights(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """Attention weights of one observation (V,) or of N (N, V), for plotting.
+        """Return attention weights of one observation (V,) or of N (N, V), for plotting.
 
         Raises:
             InputError: the policy has no attention.

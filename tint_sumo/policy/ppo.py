@@ -187,7 +187,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
         return actions
 
     def _values_at_time_limit(self, dones: np.ndarray, infos: list[dict[str, Any]], states: Tensor) -> np.ndarray:
-        """Values (N,) of the terminal observations of episodes cut off by the time limit, 0 elsewhere.
+        """Return values (N,) of the terminal observations of episodes that the time limit cut off, 0 elsewhere.
 
         The hidden state there is ``states``, (N, hidden_size): the one after the episode's last action.
         """
@@ -224,7 +224,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _update(self, batch: Sequences) -> dict[str, float]:
-        """One gradient step; returns what is worth logging."""
+        """Take one gradient step; return what is worth logging."""
         try:
             values, log_probs, entropies = self.policy.evaluate_actions(
                 batch.observations, batch.actions, batch.states, batch.episode_starts
@@ -326,7 +326,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
 
 
 def _stacked(observations: list[Any]) -> Any:
-    """Observations of some environments as one batch."""
+    """Return observations of some environments as one batch."""
     first = observations[0]
     if isinstance(first, dict):
         return {key: np.stack([observation[key] for observation in observations]) for key in first}

@@ -1,4 +1,4 @@
-"""Policies as files: NAME.safetensors with the network's weights and NAME.json, the card that says what they are.
+"""Policies as files: NAME.safetensors with the network's weights and NAME.json, the card that describes them.
 
 Neither can hold code, so that reading a policy from anywhere is safe; Stable-Baselines3's .zip files are pickles.
 """
@@ -28,7 +28,7 @@ _NETWORK = "network"  # the card's entry with all that is needed to build the ne
 
 @dataclass(frozen=True)
 class _Network:
-    """What the card says of the network."""
+    """The card's entry about the network."""
 
     settings: PolicySettings
     trait_size: Annotated[int, Range(0, 64)]
@@ -43,7 +43,7 @@ def save_policy(policy: GruPolicy, stem: Path, card: Mapping[str, Any]) -> None:
     Args:
         policy: for observations of a scene with traits.
         stem: path without suffix.
-        card: what else is worth knowing: method, training, results.
+        card: further entries: method, training, results.
     """
     space = policy.observation_space
     assert isinstance(space, spaces.Dict) and isinstance(policy.action_space, spaces.Discrete)
@@ -56,12 +56,12 @@ def save_policy(policy: GruPolicy, stem: Path, card: Mapping[str, Any]) -> None:
         "max_vehicles": traits_shape[0],
         "actions": int(policy.action_space.n),
     }
-    checksum = write_weights(weights_file(stem), _own_weights(policy))
+    checksum = write_weights(weights_file(stem), _weights_once(policy))
     write_json(card_file(stem), {**card, _NETWORK: network, **checksum})
 
 
 def load_policy_network(stem: Path) -> GruPolicy:
-    """The network in ``stem``.safetensors, ready to drive.
+    """Return the network in ``stem``.safetensors, ready to drive.
 
     Raises:
         InputError: a file is missing or damaged, or the card does not fit the weights.
@@ -76,21 +76,21 @@ def load_policy_network(stem: Path) -> GruPolicy:
         raise InputError(f"{card_file(stem)}: unusable network ({error}); restore the file") from None
     except (LookupError, TypeError, MemoryError, RuntimeError) as error:
         raise InputError(f"{card_file(stem)}: unusable network ({error!r}); restore the file") from None
-    if weights.keys() != _own_weights(policy).keys():
+    if weights.keys() != _weights_once(policy).keys():
         raise InputError(f"{card_file(stem)} does not fit the weights beside it; restore both files")
     policy.load_state_dict(weights, strict=False)  # the extractor has other names, too
     policy.set_training_mode(False)
     return policy.requires_grad_(False)
 
 
-def _own_weights(policy: GruPolicy) -> dict[str, Tensor]:
-    """The weights, each once: Stable-Baselines3 knows the features extractor of actor and critic by three names."""
+def _weights_once(policy: GruPolicy) -> dict[str, Tensor]:
+    """Return the weights, each once: Stable-Baselines3 has three names for the features extractor."""
     twins = ("pi_features_extractor.", "vf_features_extractor.")
     return {name: weights for name, weights in policy.state_dict().items() if not name.startswith(twins)}
 
 
 def read_policy_card(stem: Path) -> dict[str, Any]:
-    """The card beside the weights.
+    """Return the card beside the weights.
 
     Raises:
         InputError: it is missing, damaged or none of a policy.
@@ -102,7 +102,7 @@ def read_policy_card(stem: Path) -> dict[str, Any]:
 
 
 def read_versions(stem: Path) -> dict[str, str]:
-    """The versions of the packages that trained a policy, as its card has them; none if it does not say.
+    """Return the versions of the packages that trained a policy, by its card; none if the card has none.
 
     Raises:
         InputError: as in ``read_policy_card``, or they are no versions.

@@ -1,4 +1,4 @@
-"""Where the driver traits in the policy's observation come from (paper III-C)."""
+"""Sources of the driver traits in the policy's observation (paper III-C)."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ Observation = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Frame:
-    """What N environments show at one time, of V vehicle slots each."""
+    """Observations of N environments with V vehicle slots each, at one time."""
 
     observation: Observation  # arrays (N, ...)
     slots: dict[str, np.ndarray]  # arrays (N, V), see ``tint_sumo.envs.sb3.SceneVecEnv``
@@ -34,10 +34,10 @@ class Frame:
 
 
 class TraitSource(ABC):
-    """Where the traits of N environments' vehicles come from; ``traits`` is (N, V, size) float32."""
+    """Source of the traits of N environments' vehicles; ``traits`` is (N, V, size) float32."""
 
     size: int = LATENT_SIZE  # numbers per vehicle
-    needs_tracks: ClassVar[bool] = False  # whether it takes where vehicles are seen on their routes
+    needs_tracks: ClassVar[bool] = False  # whether it takes the positions of vehicles on their routes
     traits: np.ndarray
 
     def attach(self, num_envs: int, max_vehicles: int) -> None:
@@ -45,7 +45,7 @@ class TraitSource(ABC):
         self.traits = np.zeros((num_envs, max_vehicles, self.size), np.float32)
 
     def memory(self) -> dict[str, Any]:
-        """The arrays and tensors that hold what it knows of the present episodes, by name."""
+        """Return the arrays and tensors with all that is known of the present episodes, by name."""
         return {"traits": self.traits}
 
     @abstractmethod
@@ -83,7 +83,7 @@ class OracleTraits(TraitSource):
 
 
 def one_hot(labels: np.ndarray, size: int) -> np.ndarray:
-    """Numbers of profiles (...), -1 for nobody, to (..., size)."""
+    """Return (..., size) with 1 at the number (...) of the profile, else 0; -1, an empty slot, gives zeros."""
     hot: np.ndarray = (labels[..., None] == np.arange(size)).astype(np.float32)
     return hot
 
@@ -94,7 +94,7 @@ class Encoder(Protocol):
     latent_size: int
 
     def encode(self, states: torch.Tensor, length: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and log-variance (M, 2) of windows (M, 20, 2) of some lengths (M,)."""
+        """Return mean and log-variance (M, 2) of windows (M, 20, 2) of some lengths (M,)."""
 
 
 class EncoderTraits(TraitSource):
@@ -165,12 +165,12 @@ class EncoderTraits(TraitSource):
             row, column = np.divmod(windows.driver, ahead.shape[1])
             with torch.no_grad():
                 mean, _ = self.model.encode(torch.from_numpy(windows.states), torch.from_numpy(windows.length))
-            self.traits[envs[row], column] = self._told(mean) / self.scale
+            self.traits[envs[row], column] = self._policy_input(mean) / self.scale
 
-    def _told(self, latents: torch.Tensor) -> np.ndarray:
-        """The numbers that stand for latents (M, 2)."""
-        told: np.ndarray = latents.cpu().numpy()
-        return told
+    def _policy_input(self, latents: torch.Tensor) -> np.ndarray:
+        """Return the policy's input (M, size) for latents (M, 2)."""
+        means: np.ndarray = latents.cpu().numpy()
+        return means
 
 
 class ClassifierTraits(EncoderTraits):
@@ -182,7 +182,7 @@ class ClassifierTraits(EncoderTraits):
     size = KINDS
     model: Classifier
 
-    def _told(self, latents: torch.Tensor) -> np.ndarray:
+    def _policy_input(self, latents: torch.Tensor) -> np.ndarray:
         is_conservative = self.model.logit(latents).cpu().numpy() > 0.0
         return one_hot(np.where(is_conservative, 0, 1), self.size)
 

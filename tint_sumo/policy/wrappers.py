@@ -21,7 +21,7 @@ _NEEDED = frozenset({"ego", "vehicles", "mask"})
 
 
 class TraitObservation(VecEnvWrapper):
-    """Adds traits, (V, size) under a key, to the observations of a scene, terminal ones included.
+    """Wrapper that adds traits, (V, size) under a key, to the observations of a scene, terminal ones included.
 
     Args:
         venv: a ``tint_sumo.envs.sb3.SceneVecEnv``, or a wrapper around one.
@@ -74,12 +74,12 @@ class TraitObservation(VecEnvWrapper):
 
 
 def trait_space(max_vehicles: int, size: int) -> spaces.Box:
-    """Space of the traits of all slots, so many numbers each."""
+    """Return the space of the traits of all slots, with so many numbers each."""
     return spaces.Box(-np.inf, np.inf, (max_vehicles, size), np.float32)
 
 
 def _continued(arrays: dict[str, np.ndarray], last: dict[int, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Arrays (N, ...) with what ended episodes showed last in place of what their successors show first."""
+    """Return arrays (N, ...) with the last values of ended episodes in place of their successors' first ones."""
     if not last:
         return arrays
     continued = {key: values.copy() for key, values in arrays.items()}
@@ -98,7 +98,7 @@ _STOP = 0  # action of an episode that began within a decision
 
 
 class ActionRepeat(VecEnvWrapper):
-    """Takes each action for ``repeat`` steps and returns the sum of their rewards.
+    """Wrapper that takes each action for ``repeat`` steps and returns the sum of their rewards.
 
     An episode that ends within a decision ends the decision; the next episode then waits, with desired speed 0, for
     the rest of it. The controller and its safety check go on working at every step.
@@ -146,13 +146,13 @@ def policy_venv(
     monitored: bool = False,
     **task: Any,
 ) -> VecEnv:
-    """``num_envs`` environments of a scene, with what a policy needs around them.
+    """Return ``num_envs`` environments of a scene with the wrappers that a policy needs.
 
     Args:
         num_envs: number of environments.
         source: where the traits in the observations come from; None leaves them out.
         action_repeat: simulation steps per decision.
-        critic_sees_true_traits: observe the true traits, too, under a key of their own.
+        critic_sees_true_traits: observe the true traits, too, under another key.
         monitored: count steps and rewards of each episode for Stable-Baselines3's logger.
         task: as in ``tint_sumo.envs.scene_env.SceneEnv``.
     """
@@ -169,14 +169,14 @@ def policy_venv(
 
 @dataclass(frozen=True)
 class VenvSnapshot:
-    """Where environments made by ``policy_venv`` are, and what is remembered around them."""
+    """State of environments made by ``policy_venv`` and of their wrappers."""
 
     episodes: list[Snapshot]
     memories: list[dict[str, Any]]  # of each wrapper, from the outermost inwards
 
 
 def snapshot(venv: VecEnv) -> VenvSnapshot:
-    """What ``restore`` needs to come back to where the environments of ``policy_venv`` are, between two decisions."""
+    """Return the state of the environments of ``policy_venv`` between two decisions, for ``restore``."""
     *_, base = _layers(venv)
     assert isinstance(base, SceneVecEnv)
     return VenvSnapshot(base.snapshot(), memories(venv))
@@ -206,7 +206,7 @@ def _layers(venv: VecEnv) -> Iterator[VecEnv]:
 
 
 def _memory(wrapper: VecEnv) -> dict[str, Any]:
-    """The arrays and tensors in which a wrapper holds what it knows of the present episodes, by name."""
+    """Return the arrays and tensors with all that a wrapper knows of the present episodes, by name."""
     if isinstance(wrapper, TraitObservation):
         return wrapper.source.memory()
     if isinstance(wrapper, VecMonitor):

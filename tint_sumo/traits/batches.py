@@ -12,7 +12,7 @@ from tint_sumo.dataset.windows import WindowFile, Windows
 
 @dataclass(frozen=True)
 class WindowBatch:
-    """N windows as in ``tint_sumo.dataset.windows.Windows``; what stands after a window's length is of no account."""
+    """N windows as in ``tint_sumo.dataset.windows.Windows``; steps after a window's length have no influence."""
 
     states: Tensor  # (N, T, 2) m: offset and gap
     length: Tensor  # (N,)
@@ -20,7 +20,7 @@ class WindowBatch:
     conservative: Tensor | None = None  # (N,) bool, for methods that are trained with labels
 
     def with_noise(self, noise_m: float, generator: torch.Generator) -> "WindowBatch":
-        """The same windows as positions measured with noise would give them."""
+        """Return the same windows as if positions had been measured with noise."""
         if noise_m == 0.0:
             return self
         states = add_position_noise(self.states, noise_m, generator)
@@ -42,12 +42,12 @@ class TrainingWindows:
         return len(self._windows)
 
     def parts(self) -> Iterator[WindowBatch]:
-        """All windows in their order, some thousands at a time."""
+        """Yield all windows in their order, some thousands at a time."""
         for part in self._windows.parts():
             yield _batch(part)
 
     def batch(self, index: Tensor, generator: torch.Generator) -> WindowBatch:
-        """The windows (N,) at ``index``, beside others that ``generator`` chooses."""
+        """Return the windows (N,) at ``index``, with others that ``generator`` chooses."""
         labels = None if self._conservative is None else self._conservative[index]
         other = None
         if self._siblings is not None:
@@ -61,7 +61,7 @@ def _batch(windows: Windows) -> WindowBatch:
 
 
 class Siblings:
-    """For each window the other windows of its driver; ``driver`` (N,) numbers the drivers, each one's in a row."""
+    """Other windows of each window's driver; ``driver`` (N,) numbers the drivers, whose windows are in a row."""
 
     def __init__(self, driver: Tensor) -> None:
         found, count = torch.unique_consecutive(driver, return_counts=True)
@@ -70,7 +70,7 @@ class Siblings:
         self._end = count.cumsum(0)  # (D,) of each driver's windows
 
     def draw(self, index: Tensor, generator: torch.Generator) -> Tensor:
-        """For each window one of its driver's others at random, or itself if there is none."""
+        """Return another window of the same driver at random for each window, or the window itself if there is none."""
         driver = torch.searchsorted(self._end, index, right=True)
         end = self._end[driver]
         first = torch.where(driver > 0, self._end[driver - 1], 0)
@@ -81,12 +81,12 @@ class Siblings:
 
 
 def add_position_noise(states: Tensor, noise_m: float, generator: torch.Generator) -> Tensor:
-    """States (N, T, 2) as measured with Gaussian noise of this standard deviation on every vehicle's every position.
+    """Return states (N, T, 2) with Gaussian noise of this standard deviation on all positions of all vehicles.
 
     A driver's noise shifts its offset and its gap, the leader's the gap. Offsets still count from the first measured
-    position, and nobody's gap exceeds the one that stands for "no leader".
+    position, and no gap exceeds the number that stands for "no leader".
     """
-    own, leaders = noise_m * torch.randn(2, *states.shape[:2], generator=generator)
+    driver_m, leader_m = noise_m * torch.randn(2, *states.shape[:2], generator=generator)
     offset, gap = states.unbind(dim=-1)
-    measured_gap = torch.where(gap < NO_LEADER_GAP_M, (gap + leaders - own).clamp(max=NO_LEADER_GAP_M), gap)
-    return torch.stack((offset + own - own[:, :1], measured_gap), dim=-1)
+    measured_gap = torch.where(gap < NO_LEADER_GAP_M, (gap + leader_m - driver_m).clamp(max=NO_LEADER_GAP_M), gap)
+    return torch.stack((offset + driver_m - driver_m[:, :1], measured_gap), dim=-1)

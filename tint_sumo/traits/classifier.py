@@ -25,21 +25,21 @@ class Classifier(TraitModel):
         self.output = nn.Linear(latent_size, 1)
 
     def encode(self, states: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        """Latent and, as it is a point estimate, a log-variance of minus infinity; each (N, latent_size)."""
+        """Return the latent and, as it is a point estimate, a log-variance of minus infinity; each (N, latent_size)."""
         mean, log_var = super().encode(states, length)
         return mean, torch.full_like(log_var, -torch.inf)
 
     def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:  # noqa: ARG002
-        """Only ``total``, the cross-entropy of the classes in nats."""
+        """Return ``total`` alone, the cross-entropy of the classes in nats."""
         assert batch.conservative is not None
         mean, _ = self.encode(batch.states, batch.length)
         return {"total": functional.binary_cross_entropy_with_logits(self.logit(mean), batch.conservative.float())}
 
     def logit(self, latents: Tensor) -> Tensor:
-        """Log-odds (N,) of a conservative driver, from latents (N, latent_size)."""
+        """Return log-odds (N,) of a conservative driver, from latents (N, latent_size)."""
         logit: Tensor = self.output(latents).squeeze(-1).float()
         return logit
 
     def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
-        """None: a classifier predicts no positions."""
+        """Return nothing: a classifier predicts no positions."""
         return batch.states.new_empty(0)

@@ -21,7 +21,7 @@ class CrossWindow(TraitModel):
 
     A trait is what stays the same from one window of a driver to the next. What happens in a window alone, such as the
     noise of its positions or where the leader brakes, does not help to predict another one, so the latent drops it,
-    while a latent that must reconstruct its own window has to keep it.
+    while a latent that must reconstruct its window has to keep it.
 
     The loss is the negative log-likelihood of the other window B given this one, A, -log E_{z ~ q(z|A)} p(B | z),
     estimated with ``SAMPLES`` latents. It is a proper score of the predictive distribution, so that the variance of
@@ -43,7 +43,7 @@ class CrossWindow(TraitModel):
         self.prediction = nn.Linear(settings.decoder_output_size, 2)
 
     def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:
-        """Terms ``kl`` and ``prediction``, the negative log-likelihood of the other window, in nats per window."""
+        """Return ``kl`` and ``prediction``, the negative log-likelihood of the other window, in nats per window."""
         mean, log_var = self.encode(batch.states, batch.length)
         latents = sample(mean, log_var, generator, SAMPLES)
         displacement, log_std, target, valid = self._predict(batch, latents)
@@ -54,13 +54,13 @@ class CrossWindow(TraitModel):
         return {**terms, "total": terms["prediction"] + KL_WEIGHT * terms["kl"]}
 
     def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
-        """Errors of the next positions in the other windows, each predicted from the true ones before it."""
+        """Return errors of the next positions in the other windows, each predicted from the true ones before it."""
         mean, _ = self.encode(batch.states, batch.length)
         displacement, _, target, valid = self._predict(batch, mean.unsqueeze(0))
         return ((displacement[0] - target)[valid] * self.feature_scale[0]).square()
 
     def _predict(self, batch: WindowBatch, latents: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The other windows' scaled displacements from their second step on, T - 1 of them.
+        """Predict the other windows' scaled displacements from their second step on, T - 1 of them.
 
         Args:
             batch: N windows and others.

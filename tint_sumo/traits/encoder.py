@@ -23,7 +23,7 @@ class WindowEncoder(nn.Module):
         nn.init.constant_(self.log_var_head.bias, INITIAL_LOG_VAR)
 
     def forward(self, features: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log-variance, each (N, latent_size) float32, of features (N, T, F) of lengths (N,) from 1 to T."""
+        """Return mean and log-variance, each (N, latent_size) float32, of features (N, T, F) of lengths (N,) >= 1."""
         embedded = self.embed(features.transpose(0, 1))
         if torch.is_grad_enabled():
             last = self.gru(embedded)[0][length - 1, torch.arange(len(length), device=length.device)]
@@ -32,18 +32,18 @@ class WindowEncoder(nn.Module):
         return self.heads(last)
 
     def step(self, features: Tensor, hidden: Tensor) -> Tensor:
-        """Hidden states (N, hidden) after one more step of features (N, F)."""
+        """Return hidden states (N, hidden) after one more step of features (N, F)."""
         weight_ih, weight_hh, bias_ih, bias_hh = self.gru.all_weights[0]
         return torch.gru_cell(self.embed(features), hidden, weight_ih, weight_hh, bias_ih, bias_hh)
 
     def heads(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log-variance, each (N, latent_size) float32, of hidden states (N, hidden)."""
+        """Return mean and log-variance, each (N, latent_size) float32, of hidden states (N, hidden)."""
         summary = self.summary(hidden)
         return self.mean_head(summary).float(), self.log_var_head(summary).float()
 
 
 def last_states(gru: nn.GRU, inputs: Tensor, length: Tensor) -> Tensor:
-    """Hidden states (N, hidden) of a one-layer GRU after the last step of inputs (T, N, I) of lengths (N,).
+    """Return hidden states (N, hidden) of a one-layer GRU after the last step of inputs (T, N, I) of lengths (N,).
 
     Without gradients and several times as fast as ``gru`` itself: state, input and a constant 1 stand in the rows of
     one matrix, so that a step is one product and a few operations in place on whole rows. The state is kept as
@@ -78,16 +78,16 @@ def last_states(gru: nn.GRU, inputs: Tensor, length: Tensor) -> Tensor:
 
 
 def perceptron(*sizes: int) -> nn.Sequential:
-    """Linear layers from each size to the next, each followed by ReLU."""
+    """Return linear layers from each size to the next, each followed by ReLU."""
     return nn.Sequential(*(layer for pair in pairwise(sizes) for layer in (nn.Linear(*pair), nn.ReLU())))
 
 
 def sample(mean: Tensor, log_var: Tensor, generator: torch.Generator, samples: int = 1) -> Tensor:
-    """Latents (samples, N, latent_size) drawn from N(mean, exp(log_var))."""
+    """Return latents (samples, N, latent_size) drawn from N(mean, exp(log_var))."""
     noise = torch.randn(samples, *mean.shape, generator=generator, dtype=mean.dtype)
     return mean + noise * torch.exp(0.5 * log_var)
 
 
 def kl_divergence(mean: Tensor, log_var: Tensor) -> Tensor:
-    """KL(N(mean, exp(log_var)) || N(0, 1)) in nats, summed over the last dimension."""
+    """Return KL(N(mean, exp(log_var)) || N(0, 1)) in nats, summed over the last dimension."""
     return 0.5 * (mean.square() + log_var.exp() - log_var - 1.0).sum(dim=-1)

@@ -1,4 +1,4 @@
-"""How well traits can be read from a model's latents: with labels, which label-free methods meet nowhere else."""
+"""Accuracy of traits that are read from a model's latents, with labels, which label-free methods meet nowhere else."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -37,11 +37,11 @@ class Part:
 
 @dataclass(frozen=True)
 class TraitAccuracy:
-    """How well the latent mean tells the traits apart, on windows of unseen episodes."""
+    """Accuracy of classifiers on the latent mean, on windows of unseen episodes."""
 
     accuracy: Fraction  # share of windows that a linear support vector classifier gets right
     knn_accuracy: Fraction  # the same of the nearest neighbours in the latent space
-    majority_share: Fraction  # what one gets right who always takes the most frequent trait
+    majority_share: Fraction  # accuracy of always taking the most frequent trait
     windows: WindowCount
     error_m: float | None  # root mean square of reconstructed or predicted positions; None if the method has none
     # Share of the linear classifier's errors; None without errors or with point estimates.
@@ -94,7 +94,7 @@ class Probe:
         self._nearest.fit(mean[reference], labels[reference])
 
     def score(self, windows: Windows, labels: NDArray[np.integer]) -> TraitAccuracy:
-        """Accuracy on N windows, which the probe should not have been fitted on; the noise is drawn from its seed.
+        """Return the accuracy on N windows, which the probe should not have been fitted on.
 
         Raises:
             InputError: there are no windows.
@@ -130,7 +130,7 @@ def evaluate(
         windows: N windows.
         labels: (N,) the kind of each window's driver.
         noise_m: standard deviation of the noise on every position.
-        seed: of the split. Use the one of training, so that the test episodes are unseen by the model too.
+        seed: of the split. Use that of the training, so that the test episodes are unseen by the model too.
 
     Raises:
         InputError: the training part does not hold both traits, or the test part is empty.
@@ -143,7 +143,7 @@ def evaluate(
 def linear_r2(
     model: TraitModel, windows: Windows, properties: NDArray[np.floating], *, noise_m: float = 0.0, seed: int = 0
 ) -> NDArray[np.float64]:
-    """How well a linear map from the latent mean gives properties of the driver, on unseen episodes.
+    """Return how well a linear map from the latent mean gives properties of drivers, in unseen episodes.
 
     Args:
         model: a trained model; it is not changed.
@@ -164,7 +164,7 @@ def linear_r2(
 def fit_line(
     model: TraitModel, windows: Windows, properties: NDArray[np.floating], *, noise_m: float = 0.0, seed: int = 0
 ) -> Callable[[Windows, NDArray[np.floating]], NDArray[np.float64]]:
-    """A linear map from the latent mean to properties of the driver; call it for its R2 on other windows."""
+    """Fit a linear map from the latent mean to properties of drivers; return a function of other windows for its R2."""
     fitted = LinearRegression().fit(encode_windows(model, windows, noise_m=noise_m, seed=seed).mean, properties)
 
     def r2(windows: Windows, properties: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -176,7 +176,7 @@ def fit_line(
 
 
 def encode_windows(model: TraitModel, windows: Windows, *, noise_m: float = 0.0, seed: int = 0) -> Latents:
-    """Latents of N windows, measured with noise drawn from ``seed``.
+    """Return latents of N windows, measured with noise drawn from ``seed``.
 
     Raises:
         InputError: they are not finite.
@@ -193,7 +193,7 @@ def encode_windows(model: TraitModel, windows: Windows, *, noise_m: float = 0.0,
 
 
 def _measured(windows: Windows, noise_m: float, seed: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-    """States and lengths, a batch at a time; the noise does not depend on the size of the batches."""
+    """Yield states and lengths, a batch at a time; the noise does not depend on the size of the batches."""
     everything = TrainingWindows(windows).batch(torch.arange(len(windows)), torch.Generator())
     everything = everything.with_noise(noise_m, torch.Generator().manual_seed(seed))
     for index in _batches(len(windows)):
@@ -206,7 +206,7 @@ def _batches(windows: int) -> Iterator[slice]:
 
 
 def position_error_m(model: TraitModel, windows: Windows, *, noise_m: float = 0.0, seed: int = 0) -> float | None:
-    """Root mean square error of the positions that the model reconstructs or predicts, against the measured ones."""
+    """Return the root mean square error of positions that the model reconstructs or predicts."""
     generator = torch.Generator().manual_seed(seed)
     data = TrainingWindows(windows, with_other=model.uses_other_window)
     total, count = 0.0, 0
@@ -219,7 +219,7 @@ def position_error_m(model: TraitModel, windows: Windows, *, noise_m: float = 0.
 
 
 def _share_of_errors(correct: NDArray[np.bool_], std: NDArray[np.float32]) -> float | None:
-    """Share of the errors that lie among the tenth of the windows with the widest posterior; chance is 0.1."""
+    """Return the share of the errors in the tenth of the windows with the widest posteriors; chance is 0.1."""
     if correct.all() or not std.any():
         return None
     widest = np.argsort(-std.prod(axis=1), kind="stable")[: -(-len(correct) // 10)]

@@ -96,7 +96,7 @@ def plot_reconstructions(model: Vae, windows: Windows, file: Path, *, seed: int 
 
 
 def _numbered(latents: NDArray[np.float32], windows: Windows, conservative: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Full windows spread evenly over each trait's order along its widest latent direction."""
+    """Return full windows spread evenly over each trait's order along its widest latent direction."""
     chosen: list[int] = []
     for trait in (True, False):
         mine = np.flatnonzero((conservative == trait) & (windows.length == WINDOW_STEPS))
@@ -108,7 +108,7 @@ def _numbered(latents: NDArray[np.float32], windows: Windows, conservative: NDAr
 
 
 def _draw_street(axes: Axes, windows: Windows, conservative: NDArray[np.bool_]) -> None:
-    """One row per window: positions of the driver and of its leader, darker as time goes on."""
+    """Draw a row per window: positions of the driver and of its leader, darker as time goes on."""
     opacity: Any = np.linspace(0.15, 1.0, WINDOW_STEPS)  # matplotlib's type hints know only one for all markers
     for row in range(len(windows)):
         offset, gap = windows.states[row].T

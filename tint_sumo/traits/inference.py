@@ -27,7 +27,7 @@ def infer_traits(
     net_file: Path | None = None,
     vehicle_length_m: float = VehicleShape().length_m,
 ) -> pd.DataFrame:
-    """Latents of every vehicle, a row for each window of 2 to 20 steps of 0.1 s, by vehicle and time.
+    """Return latents of all vehicles, a row for each window of 2 to 20 steps of 0.1 s, by vehicle and time.
 
     Args:
         source: floating-car data, or trajectories of a dataset, as in ``tint_sumo.dataset.tracks.read_tracks``.

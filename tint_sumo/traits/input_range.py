@@ -40,7 +40,7 @@ class InputRange:
             high = np.maximum(high, np.where(valid, part.states, -np.inf).max(axis=0))
         missing = low > high  # no window is so long: every value there is outside
         low, high = np.where(missing, 0.0, low), np.where(missing, -1.0, high)
-        rounded = (np.round(one, 3).tolist() for one in (low[:, 0], high[:, 0], low[:, 1], high[:, 1]))
+        rounded = (np.round(steps, 3).tolist() for steps in (low[:, 0], high[:, 0], low[:, 1], high[:, 1]))
         return cls(*map(tuple, rounded))
 
     def outside(self, windows: Windows) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""What every trait representation offers, and the registry of methods."""
+"""The base class of trait models, and the registry of methods."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
@@ -30,7 +30,7 @@ class TraitModel(nn.Module, ABC):
     running sum of displacements, so this is a linear and invertible change of the paper's state (III-B1): nothing is
     added or lost, but the few centimetres per step by which traits differ are no longer dwarfed by an offset that grows
     to 6 m. Displacement has the larger spread so that the latent space is laid out along speed first: with equal
-    spreads it more often forms around who has a leader and who has none, and mirrors the traits in one of the two
+    spreads it more often forms around having a leader or none, and mirrors the traits in one of the two
     groups, which then no straight line separates.
     """
 
@@ -54,18 +54,18 @@ class TraitModel(nn.Module, ABC):
 
     @abstractmethod
     def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:
-        """Named scalar terms of the training loss and ``"total"``, the one to minimise."""
+        """Return named scalar terms of the training loss and ``"total"``, which is minimised."""
 
     @abstractmethod
     def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
-        """Squared errors (M,) in m2 of all positions that the latent means predict; M is 0 if they predict none."""
+        """Return squared errors (M,) in m2 of all positions that the latent means predict, if any."""
 
     def encode(self, states: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log-variance of the latent, each (N, latent_size)."""
+        """Return mean and log-variance of the latent, each (N, latent_size), from windows of 20 steps at most."""
         return self.encoder(self.features(states, length), length)  # type: ignore[no-any-return]
 
     def raw_features(self, states: Tensor) -> Tensor:
-        """Features (N, T, F) before they are scaled."""
+        """Return features (N, T, F) before they are scaled."""
         return displacement_and_gap(states)
 
     def fit_features(self, parts: Iterable[WindowBatch]) -> None:
@@ -80,7 +80,7 @@ class TraitModel(nn.Module, ABC):
             self.feature_scale[feature] = (moments.std if moments.std >= SMALLEST_STD else 1.0) / spread
 
     def features(self, states: Tensor, length: Tensor) -> Tensor:
-        """Scaled features (N, T, F), zero after ``length`` and where they are unknown."""
+        """Return scaled features (N, T, F), zero after ``length`` and where they are unknown."""
         gain = 1.0 / self.feature_scale
         scaled = torch.addcmul(-self.feature_mean * gain, self.raw_features(states), gain)
         features = torch.where(valid_steps(states, length).unsqueeze(-1), scaled, 0.0)
@@ -91,7 +91,7 @@ class TraitModel(nn.Module, ABC):
 
 @dataclass(frozen=True)
 class Moments:
-    """What is needed of some numbers for their mean and standard deviation together with others."""
+    """Count, mean and squares of some numbers, which add up to those of all numbers."""
 
     count: int = 0
     mean: float = 0.0
@@ -99,7 +99,7 @@ class Moments:
 
     @classmethod
     def of(cls, values: Tensor) -> "Moments":
-        """Of values (N,)."""
+        """Return the moments of values (N,)."""
         if len(values) == 0:
             return cls()
         mean = values.mean()
@@ -123,14 +123,14 @@ class Moments:
 
 
 def displacement_and_gap(states: Tensor) -> Tensor:
-    """(N, T, 2) in metres from (N, T, 2) of offset and gap; the first displacement is zero."""
+    """Return displacement and gap (N, T, 2) from offset and gap, in metres; the first displacement is zero."""
     offset, gap = states.unbind(dim=-1)
     displacement = offset.diff(dim=1, prepend=offset[:, :1])
     return torch.stack((displacement, gap), dim=-1)
 
 
 def valid_steps(states: Tensor, length: Tensor) -> Tensor:
-    """Boolean (N, T): the steps before ``length``."""
+    """Return which steps (N, T) come before ``length``."""
     return torch.arange(states.shape[1], device=states.device) < length.unsqueeze(-1)
 
 
@@ -138,7 +138,7 @@ TRAIT_METHODS: dict[str, type[TraitModel]] = {}
 
 
 def register(model: type[TraitModel]) -> type[TraitModel]:
-    """Class decorator: make a method known under ``model.method``."""
+    """Make a method known under ``model.method``; a class decorator."""
     if model.method in TRAIT_METHODS:
         raise ValueError(f"two trait methods are called {model.method!r}")
     TRAIT_METHODS[model.method] = model
@@ -146,7 +146,7 @@ def register(model: type[TraitModel]) -> type[TraitModel]:
 
 
 def find_trait_method(name: Any) -> type[TraitModel]:
-    """The method called ``name``.
+    """Return the method called ``name``.
 
     Raises:
         InputError: there is none.

@@ -31,13 +31,13 @@ class Morton(TraitModel):
         )
 
     def raw_features(self, states: Tensor) -> Tensor:
-        """Displacement (m), gap (m) and acceleration (m/s2)."""
+        """Return displacement (m), gap (m) and acceleration (m/s2)."""
         features = displacement_and_gap(states)
         change = features[..., :1].diff(dim=1, prepend=features[:, :1, :1])
         return torch.cat((features, change / STEP_S**2), dim=-1)
 
     def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:
-        """Terms ``kl`` (nats per window) and ``imitation`` (mean square of the scaled accelerations)."""
+        """Return ``kl`` (nats per window) and ``imitation`` (mean square of the scaled accelerations)."""
         features = self.features(batch.states, batch.length)
         mean, log_var = self.encoder(features, batch.length)
         chosen, driven = self._accelerations(features, sample(mean, log_var, generator)[0], batch.length)
@@ -47,14 +47,14 @@ class Morton(TraitModel):
         return {"kl": kl, "imitation": imitation, "total": total}
 
     def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
-        """Errors of the next positions, each predicted from the true ones before it."""
+        """Return errors of the next positions, each predicted from the true ones before it."""
         features = self.features(batch.states, batch.length)
         mean, _ = self.encoder(features, batch.length)
         chosen, driven = self._accelerations(features, mean, batch.length)
         return ((chosen - driven) * self.feature_scale[2] * STEP_S**2).square()
 
     def _accelerations(self, features: Tensor, latent: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        """Scaled accelerations (M,) from each state with a speed to the next one: the policy's and the driver's."""
+        """Return scaled accelerations (M,) from each state with a speed to the next: the policy's and the driver's."""
         states = features[:, 1:-1, :FEATURES]
         joined = torch.cat((states, latent.unsqueeze(1).expand(-1, states.shape[1], -1)), dim=-1)
         known = torch.arange(2, features.shape[1]) < length.unsqueeze(-1)

@@ -31,7 +31,7 @@ class ModelCard:
     entries: dict[str, Any] = field(default_factory=dict)
 
 
-_FIELDS = [one.name for one in fields(ModelCard) if one.name != "entries"]
+_FIELDS = [known.name for known in fields(ModelCard) if known.name != "entries"]
 
 
 def save(model: TraitModel, stem: Path, card: Mapping[str, Any]) -> None:

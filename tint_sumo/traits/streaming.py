@@ -69,7 +69,7 @@ class TrackStream:
         self.steps[tracks] = 0.0
 
     def memory(self) -> dict[str, Any]:
-        """The arrays and tensors that hold what it has seen, by name."""
+        """Return the arrays and tensors with all that is known of the tracks, by name."""
         return {
             "hidden": self._hidden,
             "window_steps": self._window_steps,

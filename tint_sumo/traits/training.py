@@ -65,8 +65,8 @@ def train(
         seed: of the initial weights, the order of windows and all noise.
         latent_size: numbers that represent a trait.
         conservative: (N,) the true traits, for a method that is trained with them; no other method may have them.
-        report: told of the progress.
-        card: what else the model's card shall say, such as where the windows come from.
+        report: called with the progress.
+        card: further entries of the model's card, such as the dataset of the windows.
 
     Returns:
         The trained model in evaluation mode.
@@ -113,7 +113,7 @@ class _State:
     """State of a training beside its tensors, from which it is resumed."""
 
     epochs: Annotated[int, Range(0, 2**62)]  # that are finished
-    loss: dict[str, float]  # terms of the last one
+    loss: dict[str, float]  # terms of the last epoch
 
 
 class _Run:
@@ -131,7 +131,7 @@ class _Run:
     def fit(self, out: Path, report: Report) -> dict[str, float]:
         """Run all epochs, beginning after those in the checkpoint in ``out``; the mean loss terms of the last epoch.
 
-        Each epoch draws from a generator of its own, so a checkpoint needs no generator states.
+        Each epoch draws from another generator, so a checkpoint needs no generator states.
         """
         generator = self._generator(0)
         self.model.fit_features(part.with_noise(self.settings.noise_m, generator) for part in self.data.parts())
@@ -160,13 +160,13 @@ class _Run:
         return loss
 
     def _progress(self, epoch: int, windows: int, loss: Mapping[str, float]) -> Progress:
-        """After some windows of an epoch, of which that is the loss."""
+        """Return the progress after some windows of an epoch, which had this loss."""
         every = len(self.data)
         measures = {"loss": loss["total"]} if loss else {}
         return Progress(epoch * every + windows, self.settings.epochs * every, "window", measures)
 
     def _run_epoch(self, epoch: int, report: Report) -> dict[str, float]:
-        """One pass over the shuffled windows; the mean of each loss term over the batches."""
+        """Run once over the shuffled windows; return the mean of each loss term over the batches."""
         generator = self._generator(1 + epoch)
         order = torch.randperm(len(self.data), generator=generator)
         starts = range(0, len(order), self.settings.batch_size)
@@ -188,7 +188,7 @@ class _Run:
         return means
 
     def _step(self, batch: WindowBatch, remaining: float, generator: torch.Generator) -> dict[str, float]:
-        """One gradient step at the fraction ``remaining`` of the learning rate; the loss terms.
+        """Take one gradient step at the fraction ``remaining`` of the learning rate; return the loss terms.
 
         Raises:
             FloatingPointError: the loss or its gradient is not finite; the weights are as before.
@@ -209,7 +209,7 @@ class _Run:
         return torch.Generator().manual_seed(_stream_seed(self.seed, stream))
 
     def _resume(self, out: Path) -> tuple[int, dict[str, float]]:
-        """Go on from the checkpoint if there is one; the number of finished epochs and the last one's loss terms."""
+        """Go on from the checkpoint, if any; return the number of finished epochs and the last epoch's loss terms."""
         found = read_checkpoint(out, _State)
         if found is None:
             return 0, {}

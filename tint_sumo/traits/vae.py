@@ -34,7 +34,7 @@ class Vae(TraitModel):
         )
 
     def decode(self, latent: Tensor, steps: int) -> Tensor:
-        """Reconstructed features (N, steps, 2) of latents (N, latent_size)."""
+        """Return reconstructed features (N, steps, 2) of latents (N, latent_size)."""
         state = latent.new_full((len(latent), FEATURES), START_OF_SEQUENCE)
         hidden = latent.new_zeros(len(latent), self.settings.hidden_size)
         states = []
@@ -45,14 +45,14 @@ class Vae(TraitModel):
         return torch.stack(states, dim=1)
 
     def reconstruct(self, states: Tensor, length: Tensor) -> Tensor:
-        """Offset and gap (N, T, 2) in m as decoded from the latent means of windows."""
+        """Return offset and gap (N, T, 2) in m as decoded from the latent means of windows."""
         decoded = self.decode(self.encode(states, length)[0], states.shape[1])
         displacement, gap = (decoded * self.feature_scale + self.feature_mean).unbind(dim=-1)
         offset = displacement[:, 1:].cumsum(dim=1)
         return torch.stack((functional.pad(offset, (1, 0)), gap), dim=-1)
 
     def loss(self, batch: WindowBatch, generator: torch.Generator) -> dict[str, Tensor]:
-        """Terms ``kl`` (nats per window) and ``reconstruction`` (mean square of the features of valid steps)."""
+        """Return ``kl`` (nats per window) and ``reconstruction`` (mean square of the features of valid steps)."""
         features = self.features(batch.states, batch.length)
         mean, log_var = self.encoder(features, batch.length)
         decoded = self.decode(sample(mean, log_var, generator)[0], features.shape[1])
@@ -65,7 +65,7 @@ class Vae(TraitModel):
         return {**terms, "total": total}
 
     def squared_errors_m2(self, batch: WindowBatch) -> Tensor:
-        """Errors of the reconstructed offsets, from the second step on."""
+        """Return errors of the reconstructed offsets, from the second step on."""
         offset = self.reconstruct(batch.states, batch.length)[..., 0]
         moving = valid_steps(batch.states, batch.length)[:, 1:]
         return (offset - batch.states[..., 0])[:, 1:][moving].square()

@@ -32,7 +32,7 @@ from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.scenes.geometry import clearance_m
 from tint_sumo.simulation import SceneSimulation, Simulation
 from tint_sumo.study.budgets import BUDGETS
-from tint_sumo.study.figures import plot_bars, plot_worlds
+from tint_sumo.study.figures import plot_bars, plot_conditions
 from tint_sumo.study.jobs import label
 from tint_sumo.study.results import read_results
 from tint_sumo.study.results_csv import read_csv
@@ -115,7 +115,7 @@ def make_figures(images: Path) -> None:
     """Draw the figures of the navigation study and of the comparison of trait methods, from their shipped tables."""
     rows, _ = read_csv(DATA / "results" / "navigation.csv")
     plot_bars(at_mixes(rows), images / "navigation.png")
-    plot_worlds(over_all_mixes(rows), images / "worlds.png")
+    plot_conditions(over_all_mixes(rows), images / "conditions.png")
     plot_noise(pandas.read_csv(DATA / "results" / "traits.csv"), images / "traits.png")
 
 

@@ -12,14 +12,14 @@ from tint_sumo.study.page import write_page
 from tint_sumo.study.report import StudyReport, write_report
 
 CURVE = "decisions,success,timeout,collision\n64,0.1,0.4,0.5\n128,0.6,0.1,0.3\n"
-WORLDS = (Conditions(ALL_MIXES), Conditions(ALL_MIXES, 0.1))
+OTHERS = (Conditions(ALL_MIXES), Conditions(ALL_MIXES, 0.1))
 
 
 def small_study(out: Path) -> Path:
     """Results of rules and of a shipped policy, made by hand: their episodes are real, and may end otherwise."""
     fared = {"always_go": (1, 0, 2), "ttc": (1, 0, 2), "vae": (3, 0, 0)}
     results = [
-        given(name, {Conditions(Mix(0.25)): counts, Conditions(Mix(0.4)): counts, **dict.fromkeys(WORLDS, counts)})
+        given(name, {Conditions(Mix(0.25)): counts, Conditions(Mix(0.4)): counts, **dict.fromkeys(OTHERS, counts)})
         for name, counts in fared.items()
     ]
     write_results(results, out)

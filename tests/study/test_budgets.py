@@ -55,7 +55,7 @@ def test_the_paper_s_budget_is_the_paper_s() -> None:
     ]
 
 
-def test_the_full_budget_compares_all_methods_with_four_seeds_in_other_worlds_too() -> None:
+def test_the_full_budget_compares_all_methods_with_four_seeds_in_other_conditions_too() -> None:
     full = BUDGETS["full"]
     assert len(full.seeds) == 4 and full.mixes == (ALL_MIXES,)
     trained = [method for method in map(find_method, full.methods) if isinstance(method, Learned)]

@@ -12,7 +12,7 @@ from tint_sumo.study.ceiling import ceiling
 from tint_sumo.study.ceiling_job import CEILINGS_FILE, CeilingJob, read_ceilings
 
 
-def test_there_is_a_ceiling_for_each_mix_of_the_training_s_world(tmp_path: Path) -> None:
+def test_there_is_a_ceiling_for_each_mix_of_the_training_s_conditions(tmp_path: Path) -> None:
     elsewhere = (
         Conditions(Mix(0.9), 0.1),
         Conditions(Mix(0.9), percent=25),

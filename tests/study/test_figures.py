@@ -15,11 +15,11 @@ from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.methods.registry import METHODS
 from tint_sumo.study import figures
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.figures import plot_bars, plot_curves, plot_worlds
+from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves
 from tint_sumo.study.summary import at_mixes, over_all_mixes, tabulate
 
 AS_TRAINED = Conditions(ALL_MIXES)
-WORLDS = (
+OTHERS = (
     AS_TRAINED,
     *(Conditions(ALL_MIXES, position_noise_m=noise_m) for noise_m in (0.05, 0.1)),
     *(Conditions(ALL_MIXES, tau_s=tau_s) for tau_s in (0.7, 1.5)),
@@ -28,8 +28,8 @@ WORLDS = (
 MIXES = tuple(Conditions(Mix(p)) for p in (0.1, 0.25, 0.4, 0.9))
 ROWS = tabulate(
     [
-        *(trained("oracle", seed, dict.fromkeys((*MIXES, *WORLDS), (8 + seed, 1, 1 - seed))) for seed in (0, 1)),
-        given("ttc", dict.fromkeys((*MIXES[1:], *WORLDS[:5]), (5, 4, 1))),
+        *(trained("oracle", seed, dict.fromkeys((*MIXES, *OTHERS), (8 + seed, 1, 1 - seed))) for seed in (0, 1)),
+        given("ttc", dict.fromkeys((*MIXES[1:], *OTHERS[:5]), (5, 4, 1))),
     ]
 )
 
@@ -120,10 +120,10 @@ def test_every_method_has_a_curve_of_its_own_look(tmp_path: Path, drawn: Callabl
     assert looks == [(one.look.colour, one.look.marker, one.look.dash) for one in METHODS.values()]
 
 
-def test_worlds_have_a_panel_for_each_condition_through_the_training_s_world(
+def test_each_condition_has_a_panel_through_the_training_s_conditions(
     tmp_path: Path, drawn: Callable[[], Figure]
 ) -> None:
-    assert_picture(plot_worlds(over_all_mixes(ROWS), tmp_path / "worlds.png"))
+    assert_picture(plot_conditions(over_all_mixes(ROWS), tmp_path / "conditions.png"))
     noise, tau, percent = drawn().axes
     shown = [[list(container.lines[0].get_xdata()) for container in axes.containers] for axes in (noise, tau, percent)]
     assert shown[0] == [[0.0, 0.05, 0.1]] * 2
@@ -136,7 +136,7 @@ def test_worlds_have_a_panel_for_each_condition_through_the_training_s_world(
 
 def test_methods_of_the_past_are_drawn_under_their_names(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
     rows = tabulate([trained("forgotten", 0, {AS_TRAINED: (1, 1, 0), Conditions(Mix(0.4)): (1, 1, 0)})])
-    assert_picture(plot_worlds(over_all_mixes(rows), tmp_path / "worlds.png"))
+    assert_picture(plot_conditions(over_all_mixes(rows), tmp_path / "conditions.png"))
     assert [container.get_label() for container in drawn().axes[0].containers] == ["forgotten"]
     plot_bars(at_mixes(rows), tmp_path / "bars.png")
     assert drawn().axes[0].get_yticklabels()[0].get_text() == "forgotten"

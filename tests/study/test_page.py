@@ -28,7 +28,7 @@ from tint_sumo.scenes.layout import layout
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.page import write_page
-from tint_sumo.study.page.charts import curve_chart, outcome_chart, world_charts
+from tint_sumo.study.page.charts import condition_charts, curve_chart, outcome_chart
 from tint_sumo.study.page.choosing import MOST_CASES, Choice, Shown, choose, choose_cases
 from tint_sumo.study.page.episodes import Recorded, Recordings, failure_lists
 from tint_sumo.study.page.findings import what_came_out
@@ -80,8 +80,8 @@ def test_the_middle_mix_that_most_policies_met_is_shown_with_first_seeds() -> No
     choice = choose(rows)
     assert choice.conditions == Conditions(Mix(0.4))
     assert [one.label for one in choice.policies] == ["ttc", "oracle-shipped", "oracle-P0.1to0.9-seed3"]
-    only_worlds = choose(tabulate([given("ttc", {Conditions(ALL_MIXES, 0.1): counts})]))
-    assert only_worlds.conditions == Conditions(ALL_MIXES, 0.1)
+    only_others = choose(tabulate([given("ttc", {Conditions(ALL_MIXES, 0.1): counts})]))
+    assert only_others.conditions == Conditions(ALL_MIXES, 0.1)
 
 
 # What is recorded
@@ -206,15 +206,15 @@ def test_charts_and_their_tables_tell_the_rates_and_intervals() -> None:
 def test_a_method_has_one_colour_in_figures_and_on_the_page() -> None:
     rows = tabulate([given(name, {Conditions(ALL_MIXES): (4, 0, 1)}) for name in METHODS])
     rows += tabulate([given(name, {Conditions(ALL_MIXES, 0.1): (3, 0, 2)}) for name in METHODS])
-    (chart,) = world_charts(rows)
+    (chart,) = condition_charts(rows)
     shown = [(trace["marker"]["color"], trace["line"]["color"]) for trace in chart.figure["data"]]
     assert shown == [(method.look.colour, method.look.colour) for method in METHODS.values()]
 
 
-def test_worlds_have_a_chart_for_every_condition_that_varies() -> None:
+def test_conditions_have_a_chart_for_every_condition_that_varies() -> None:
     noisy, later = Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, tau_s=1.5)
     rows = tabulate([given("ttc", {Conditions(ALL_MIXES): (4, 0, 1), noisy: (3, 0, 2), later: (2, 0, 3)})])
-    noise, headway = world_charts(rows)
+    noise, headway = condition_charts(rows)
     assert (noise.figure["data"][0]["x"], noise.figure["data"][0]["y"]) == ([0.0, 0.1], [80.0, 60.0])
     assert (headway.figure["data"][0]["x"], headway.figure["data"][0]["y"]) == ([1.0, 1.5], [80.0, 40.0])
 
@@ -262,7 +262,7 @@ def section(page: str, name: str) -> str:
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The page of a study whose policies are gone, and that tested in one other world alone."""
+    """The page of a study whose policies are gone, and that tested in other conditions alone."""
     out = tmp_path_factory.mktemp("bare")
     counts = {Conditions(Mix(0.4)): (18, 1, 1)}
     write_results([trained("oracle", 0, counts), trained("no_labels", 0, counts)], out)
@@ -274,7 +274,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_sections_without_data_say_why_they_are_left_out(bare: str) -> None:
     for name, reason in (
         ("curves", "the study's folder has no learning curves"),
-        ("worlds", "the world of their training alone"),
+        ("conditions", "the conditions of their training alone"),
         ("player", "none of the study's policies can be loaded"),
         ("failures", "no episodes were recorded"),
         ("latents", "no method of the study infers traits with a model"),

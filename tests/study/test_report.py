@@ -17,7 +17,7 @@ from tint_sumo.study.results import Result
 from tint_sumo.study.results_csv import read_csv, to_csv
 from tint_sumo.study.summary import Row, tabulate
 
-WORLD, NOISY, HALF = Conditions(ALL_MIXES), Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, percent=50)
+AS_TRAINED, NOISY, HALF = Conditions(ALL_MIXES), Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, percent=50)
 CURVE = "decisions,success,timeout,collision\n64,0.1,0.4,0.5\n128,0.6,0.1,0.3\n"
 CEILINGS = {"0.25": 0.875, "0.4": 1.0}
 OUTCOMES = ("success", "timeout", "collision")
@@ -29,7 +29,7 @@ def policy(method: str, seed: int, success: int) -> Result:
     tested = {
         Conditions(Mix(0.25)): (success - 2, timeout, collision + 2),
         Conditions(Mix(0.4)): (success, timeout, collision),
-        WORLD: (success - 1, timeout, collision + 1),
+        AS_TRAINED: (success - 1, timeout, collision + 1),
         NOISY: (success - 3, timeout, collision + 3),
         HALF: (success - 4, timeout, collision + 4),
     }
@@ -40,7 +40,7 @@ SEVERAL_SEEDS = [
     *(policy("oracle", seed, success) for seed, success in enumerate((19, 18, 19))),
     *(policy("no_labels", seed, success) for seed, success in enumerate((8, 7, 6))),
     *(policy("vae", seed, success) for seed, success in enumerate((15, 12, 14))),
-    given("always_go", {Conditions(Mix(0.4)): (0, 0, 20), WORLD: (0, 0, 20)}),
+    given("always_go", {Conditions(Mix(0.4)): (0, 0, 20), AS_TRAINED: (0, 0, 20)}),
 ]
 ONE_SEED = [policy("oracle", 0, 18), given("ttc", {Conditions(Mix(0.25)): (5, 4, 1), Conditions(Mix(0.6)): (9, 1, 0)})]
 
@@ -80,7 +80,7 @@ def tables(markdown: str) -> dict[str, list[list[str]]]:
 
 def test_every_file_is_written_and_nothing_else(study: Path, report: StudyReport) -> None:
     assert report.markdown_file.read_text() == report.markdown
-    assert [file.name for file in report.figure_files] == ["results.png", "worlds.png", "curves.png"]
+    assert [file.name for file in report.figure_files] == ["results.png", "conditions.png", "curves.png"]
     for file in report.figure_files:
         with Image.open(file) as figure:
             assert figure.format == "PNG" and figure.width > 500
@@ -95,11 +95,11 @@ def test_every_file_is_written_and_nothing_else(study: Path, report: StudyReport
 def test_the_csv_file_has_a_line_for_every_row_and_the_documented_columns(report: StudyReport) -> None:
     with report.csv_file.open(newline="") as file:
         lines = list(csv.DictReader(file))
-    world = ["p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent"]
+    conditions = ["p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent"]
     closing = ["navigation_time_s", "episodes", "seeds", "ceiling_percent"]
     measured = [f"{outcome}{part}_percent" for outcome in OUTCOMES for part in ("", "_low", "_high", "_sd")]
     paper = [f"paper_{outcome}_percent" for outcome in OUTCOMES]
-    assert list(lines[0]) == ["method", "origin", "trained_p_conservative", *world, *measured, *closing, *paper]
+    assert list(lines[0]) == ["method", "origin", "trained_p_conservative", *conditions, *measured, *closing, *paper]
     assert [line["method"] for line in lines] == [row.method for row in report.rows]
     assert not any(None in line or None in line.values() for line in lines)
 
@@ -158,7 +158,7 @@ def test_every_table_of_several_seeds_is_there(report: StudyReport) -> None:
         "All outcomes",
         "Who is hit",
         "Differences in success",
-        "Other worlds and shorter trainings",
+        "Other conditions and shorter trainings",
     ]
 
 
@@ -216,8 +216,8 @@ def test_methods_that_did_not_meet_the_same_cases_are_not_compared() -> None:
     assert line == ["paper's method", "oracle", "-", "-"]
 
 
-def test_other_worlds_stand_beside_the_training_s(report: StudyReport) -> None:
-    assert tables(report.markdown)["Other worlds and shorter trainings"] == [
+def test_other_conditions_stand_beside_those_of_the_training(report: StudyReport) -> None:
+    assert tables(report.markdown)["Other conditions and shorter trainings"] == [
         ["method", "as trained", "noise 0.1 m", "50 % of training"],
         ["always go", "0.0 (100.0)", "-", "-"],
         ["no labels", "30.0 (65.0)", "20.0 (75.0)", "15.0 (80.0)"],
@@ -228,7 +228,7 @@ def test_other_worlds_stand_beside_the_training_s(report: StudyReport) -> None:
 
 def test_a_study_with_one_seed_and_no_curves_has_no_differences(tmp_path: Path) -> None:
     report = write_report(write_results(ONE_SEED, tmp_path))
-    assert [file.name for file in report.figure_files] == ["results.png", "worlds.png"]
+    assert [file.name for file in report.figure_files] == ["results.png", "conditions.png"]
     found = tables(report.markdown)
     assert "Differences in success" not in found
     assert found["Success by mix of drivers"] == [
@@ -238,16 +238,16 @@ def test_a_study_with_one_seed_and_no_curves_has_no_differences(tmp_path: Path) 
     ]
 
 
-def test_a_study_of_a_single_world_has_one_figure(tmp_path: Path) -> None:
-    report = write_report(write_results([given("ttc", {WORLD: (2, 1, 1)})], tmp_path))
-    assert [file.name for file in report.figure_files] == ["worlds.png"]
-    assert list(tables(report.markdown)) == ["Other worlds and shorter trainings"]
+def test_a_study_in_one_set_of_conditions_has_one_figure(tmp_path: Path) -> None:
+    report = write_report(write_results([given("ttc", {AS_TRAINED: (2, 1, 1)})], tmp_path))
+    assert [file.name for file in report.figure_files] == ["conditions.png"]
+    assert list(tables(report.markdown)) == ["Other conditions and shorter trainings"]
 
 
 def test_a_training_without_an_episode_yet_has_no_curve(tmp_path: Path) -> None:
     write_results(ONE_SEED, tmp_path)
     write_text(tmp_path / "policies" / "oracle-P0.1to0.9-seed0" / CURVE_FILE, CURVE.splitlines()[0] + "\n")
-    assert [file.name for file in write_report(tmp_path).figure_files] == ["results.png", "worlds.png"]
+    assert [file.name for file in write_report(tmp_path).figure_files] == ["results.png", "conditions.png"]
 
 
 @pytest.mark.parametrize("file", [CEILINGS_FILE, f"policies/oracle-P0.1to0.9-seed0/{CURVE_FILE}"])

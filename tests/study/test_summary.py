@@ -12,14 +12,14 @@ from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.results import TRAINED
 from tint_sumo.study.summary import Row, at_mixes, over_all_mixes, tabulate, varied
 
-WORLD = Conditions(ALL_MIXES)
+AS_TRAINED = Conditions(ALL_MIXES)
 NOISY, SLOW, FAST = Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, tau_s=1.5), Conditions(ALL_MIXES, tau_s=0.7)
 HALF = Conditions(ALL_MIXES, percent=50)
 
 SOME_RESULTS = [
-    trained("oracle", 1, {Conditions(Mix(0.4)): (8, 1, 1), WORLD: (5, 0, 0)}),
+    trained("oracle", 1, {Conditions(Mix(0.4)): (8, 1, 1), AS_TRAINED: (5, 0, 0)}),
     given("ttc", {Conditions(Mix(0.25)): (5, 4, 1), Conditions(Mix(0.4)): (6, 4, 0)}),
-    trained("oracle", 0, {Conditions(Mix(0.4)): (9, 1, 0), WORLD: (4, 0, 1)}),
+    trained("oracle", 0, {Conditions(Mix(0.4)): (9, 1, 0), AS_TRAINED: (4, 0, 1)}),
     given("always_go", {Conditions(Mix(0.4)): (0, 0, 10)}),
 ]
 
@@ -54,14 +54,14 @@ def test_rows_go_by_conditions_and_then_in_the_order_of_the_registry() -> None:
         ("always_go", Conditions(Mix(0.4))),
         ("ttc", Conditions(Mix(0.4))),
         ("oracle", Conditions(Mix(0.4))),
-        ("oracle", WORLD),
+        ("oracle", AS_TRAINED),
     ]
 
 
-def test_the_training_s_world_comes_first_and_shorter_trainings_last() -> None:
-    worlds = (HALF, SLOW, NOISY, FAST, WORLD, Conditions(Mix(0.4)))
-    rows = tabulate([trained("oracle", 0, dict.fromkeys(worlds, (1, 0, 0)))])
-    assert [row.conditions for row in rows] == [Conditions(Mix(0.4)), WORLD, FAST, SLOW, NOISY, HALF]
+def test_the_training_s_conditions_come_first_and_shorter_trainings_last() -> None:
+    conditions = (HALF, SLOW, NOISY, FAST, AS_TRAINED, Conditions(Mix(0.4)))
+    rows = tabulate([trained("oracle", 0, dict.fromkeys(conditions, (1, 0, 0)))])
+    assert [row.conditions for row in rows] == [Conditions(Mix(0.4)), AS_TRAINED, FAST, SLOW, NOISY, HALF]
 
 
 def test_trainings_for_other_mixes_and_shipped_policies_are_rows_of_their_own() -> None:
@@ -73,7 +73,7 @@ def test_trainings_for_other_mixes_and_shipped_policies_are_rows_of_their_own() 
 
 
 def test_a_method_that_is_no_longer_known_keeps_its_name_and_comes_last() -> None:
-    rows = tabulate([trained("forgotten", 0, {WORLD: (1, 0, 0)}), *SOME_RESULTS])
+    rows = tabulate([trained("forgotten", 0, {AS_TRAINED: (1, 0, 0)}), *SOME_RESULTS])
     assert rows[-1].title == "forgotten"
 
 
@@ -90,7 +90,7 @@ def test_intervals_are_over_seeds_and_cases_or_over_the_cases_of_the_only_seed(o
 
 def test_the_paper_s_numbers_stand_beside_the_paper_s_own_conditions_alone() -> None:
     fared = dict.fromkeys(
-        (Conditions(Mix(0.4)), Conditions(Mix(0.4), 0.1), Conditions(Mix(0.4), percent=50), WORLD), (1, 0, 0)
+        (Conditions(Mix(0.4)), Conditions(Mix(0.4), 0.1), Conditions(Mix(0.4), percent=50), AS_TRAINED), (1, 0, 0)
     )
     published = {
         (row.method, row.conditions): row.published for row in tabulate([trained("oracle", 0, fared), *SOME_RESULTS])
@@ -99,18 +99,18 @@ def test_the_paper_s_numbers_stand_beside_the_paper_s_own_conditions_alone() -> 
     assert not any(published.values())
 
 
-def test_the_main_table_has_the_mixes_and_another_one_the_worlds() -> None:
-    fared = dict.fromkeys((Conditions(Mix(0.4)), Conditions(Mix(0.4), 0.1), WORLD, NOISY, HALF), (1, 0, 0))
+def test_the_main_table_has_the_mixes_and_another_one_the_conditions() -> None:
+    fared = dict.fromkeys((Conditions(Mix(0.4)), Conditions(Mix(0.4), 0.1), AS_TRAINED, NOISY, HALF), (1, 0, 0))
     rows = tabulate([trained("oracle", 0, fared)])
     assert [row.conditions for row in at_mixes(rows)] == [Conditions(Mix(0.4))]
-    assert [row.conditions for row in over_all_mixes(rows)] == [WORLD, NOISY, HALF]
+    assert [row.conditions for row in over_all_mixes(rows)] == [AS_TRAINED, NOISY, HALF]
 
 
 def test_rows_tell_the_headway_of_the_scene_s_drivers_where_no_other_one_is_tested() -> None:
     close = Conditions(ALL_MIXES, tau_s=1.0)
-    result = trained("oracle", 0, dict.fromkeys((close, SLOW, FAST, WORLD), (1, 0, 0)))
+    result = trained("oracle", 0, dict.fromkeys((close, SLOW, FAST, AS_TRAINED), (1, 0, 0)))
     rows = tabulate([replace(result, scene_tau_s=1.4)])
-    assert [row.conditions for row in rows] == [WORLD, SLOW, close, FAST]
+    assert [row.conditions for row in rows] == [AS_TRAINED, SLOW, close, FAST]
     assert [row.to_json()["tau_s"] for row in rows] == [1.4, 1.5, 1.0, 0.7]
     assert list(varied(rows, "tau_s")) == [0.7, 1.0, 1.4, 1.5]
     assert list(varied(rows, "position_noise_m")) == [0.0]
@@ -135,5 +135,5 @@ def test_rows_are_ready_for_json() -> None:
 def test_collisions_are_counted_over_all_seeds() -> None:
     lower, upper = Case("collision", 4.0, "aggressive", "lower"), Case("collision", 4.0, "conservative", "upper")
     evaluations = (Evaluation((lower, lower)), Evaluation((lower, upper)))
-    row = Row("oracle", TRAINED, ALL_MIXES, WORLD, (0, 1), 1.0, evaluations)
+    row = Row("oracle", TRAINED, ALL_MIXES, AS_TRAINED, (0, 1), 1.0, evaluations)
     assert row.collisions == {"aggressive, lower": 3, "conservative, upper": 1}

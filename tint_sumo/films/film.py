@@ -48,7 +48,7 @@ def render_case(
 ) -> Film:
     """Drive one unseen case and write what happened: a film, or for .png a strip of its moments.
 
-    A film shows every step of the simulation and runs as fast as the world.
+    A film shows every step of the simulation and runs in real time.
 
     Args:
         contender: who drives.

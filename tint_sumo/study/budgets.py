@@ -25,7 +25,7 @@ from tint_sumo.methods.registry import METHODS
 
 @dataclass(frozen=True)
 class Conditions:
-    """The world in which a policy is tested, and after which part of its training."""
+    """The conditions in which a policy is tested, and after which part of its training."""
 
     p_conservative: Mix
     position_noise_m: NoiseM = 0.0
@@ -41,7 +41,7 @@ class Conditions:
 
     @property
     def is_single_mix(self) -> bool:
-        """Whether all cases have one P(conservative), and nothing else differs from the world of the training."""
+        """Whether all cases have one P(conservative), and nothing else differs from the conditions of the training."""
         return self.p_conservative.is_single and self == Conditions(self.p_conservative)
 
     @property
@@ -60,7 +60,7 @@ class Conditions:
 
     @property
     def label(self) -> str:
-        """What differs from the world of the training, for tables and figures."""
+        """What differs from the conditions of the training, for tables and figures."""
         parts = [
             f"noise {self.position_noise_m:g} m" if self.position_noise_m else "",
             f"tau {self.tau_s:g} s" if self.tau_s is not None else "",

@@ -15,7 +15,7 @@ from tint_sumo.core.percentages import percent
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.methods.registry import METHODS, look_of
 from tint_sumo.study.jobs import smoothed_percent
-from tint_sumo.study.summary import WORLDS, Summary, by_title, varied
+from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, varied
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
 INK = {"success": "white", "timeout": "black", "collision": "white"}  # colours of the numbers on these colours
@@ -97,11 +97,11 @@ def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Pat
     return _write(figure, file)
 
 
-def plot_worlds(rows: Sequence[Summary], file: Path) -> Path:
-    """Success in worlds other than the training's, and after parts of the training; a line per method."""
+def plot_conditions(rows: Sequence[Summary], file: Path) -> Path:
+    """Success in conditions other than those of the training, and after parts of the training; a line per method."""
     figure = Figure(figsize=(11.0, 4.2), dpi=150, layout="constrained")
     all_axes = figure.subplots(1, 3, sharey=True)
-    for axes, (name, title) in zip(all_axes, WORLDS.items(), strict=True):
+    for axes, (name, title) in zip(all_axes, CONDITION_TITLES.items(), strict=True):
         for own in by_title(rows).values():
             _plot_line(axes, own, name)
         axes.set_xlabel(title)

@@ -10,7 +10,7 @@ from tint_sumo.core.percentages import percent
 from tint_sumo.core.statistics import difference_interval
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.study.ceiling_job import read_ceilings
-from tint_sumo.study.figures import plot_bars, plot_curves, plot_worlds
+from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.results import read_results
 from tint_sumo.study.results_csv import Ceilings, to_csv
@@ -42,7 +42,7 @@ def write_report(out: Path) -> StudyReport:
     if at_mixes(rows):
         figures.append(plot_bars(at_mixes(rows), out / "results.png"))
     if over_all_mixes(rows):
-        figures.append(plot_worlds(over_all_mixes(rows), out / "worlds.png"))
+        figures.append(plot_conditions(over_all_mixes(rows), out / "conditions.png"))
     if curves := read_curves(out):
         figures.append(plot_curves(curves, out / "curves.png"))
     tables = result_tables(rows, ceilings)
@@ -59,7 +59,7 @@ def to_markdown(tables: Sequence[Table]) -> str:
 
 def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
     """All tables for readers."""
-    main, worlds = at_mixes(rows), over_all_mixes(rows)
+    main, varied = at_mixes(rows), over_all_mixes(rows)
     tables = []
     if main:
         tables.append(Table("Success by mix of drivers", _success_lines(main, ceilings), _SUCCESS_NOTE))
@@ -67,8 +67,8 @@ def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
         tables.append(Table("Who is hit", _collision_lines(main), _COLLISION_NOTE))
     if _compared(main):
         tables.append(Table("Differences in success", _difference_lines(main), _DIFFERENCE_NOTE))
-    if worlds:
-        tables.append(Table("Other worlds and shorter trainings", _world_lines(worlds), _WORLDS_NOTE))
+    if varied:
+        tables.append(Table("Other conditions and shorter trainings", _condition_lines(varied), _CONDITIONS_NOTE))
     return tables
 
 
@@ -87,9 +87,9 @@ _DIFFERENCE_NOTE = (
     "Difference to another method's success on the same cases, in percentage points with 95 % intervals over seeds and "
     "cases (bootstrap)."
 )
-_WORLDS_NOTE = (
+_CONDITIONS_NOTE = (
     "Success (collision) in percent; every case has its own P(conservative) between 0.1 and 0.9. The first column is "
-    "the world of the training."
+    "the conditions of the training."
 )
 
 
@@ -163,14 +163,14 @@ def _difference(row: Row | None, other: Row | None) -> str:
     return f"{100 * (row.rate('success') - other.rate('success')):+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
 
 
-def _world_lines(rows: Sequence[Summary]) -> Lines:
-    worlds = list(dict.fromkeys(row.conditions for row in rows))
-    lines = [["method", *(one.label for one in worlds)]]
+def _condition_lines(rows: Sequence[Summary]) -> Lines:
+    varied = list(dict.fromkeys(row.conditions for row in rows))
+    lines = [["method", *(one.label for one in varied)]]
     for title, own in by_title(rows).items():
         at = {row.conditions: row for row in own}
         cells = [
             f"{percent(at[one].rate('success'))} ({percent(at[one].rate('collision'))})" if one in at else "-"
-            for one in worlds
+            for one in varied
         ]
         lines.append([title, *cells])
     return lines

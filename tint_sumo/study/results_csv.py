@@ -17,9 +17,9 @@ from tint_sumo.study.summary import Summary
 Ceilings = Mapping[float, float]  # share of the cases that a careful driver can finish, by P(conservative)
 
 _PARTS = ("", "_low", "_high", "_sd")  # a rate, the ends of its interval, its spread between seeds
-_WORLD = ("p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent")
+_CONDITIONS = ("p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent")
 COLUMNS = (
-    *("method", "origin", "trained_p_conservative", *_WORLD),
+    *("method", "origin", "trained_p_conservative", *_CONDITIONS),
     *(f"{outcome}{part}_percent" for outcome in OUTCOMES for part in _PARTS),
     *("navigation_time_s", "episodes", "seeds", "ceiling_percent"),
     *(f"paper_{outcome}_percent" for outcome in OUTCOMES),
@@ -62,7 +62,7 @@ def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
     writer.writerow(COLUMNS)
     for row in rows:
         conditions, time_s = row.resolved, row.navigation_time_s
-        world = (conditions.position_noise_m, conditions.tau_s, row.scene_tau_s, conditions.percent)
+        tested = (conditions.position_noise_m, conditions.tau_s, row.scene_tau_s, conditions.percent)
         p = conditions.p_conservative
         ceiling = ceilings.get(p.low) if p.is_single else None
         numbers: list[str] = []
@@ -71,7 +71,7 @@ def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
         writer.writerow(
             [
                 *(row.method, row.origin, "" if row.mix is None else row.mix.text, p.text),
-                *(f"{value:g}" for value in world),
+                *(f"{value:g}" for value in tested),
                 *numbers,
                 "" if time_s is None else f"{time_s:.2f}",
                 row.episodes,
@@ -109,7 +109,7 @@ def _row(line: Mapping[str, str]) -> StoredRow:
         rates[outcome], limits[outcome] = _read_percent(rate), (_read_percent(low), _read_percent(high))
         spreads[outcome] = _read_percent(spread) if spread else None
     mix, time_s = line["trained_p_conservative"], line["navigation_time_s"]
-    p, noise_m, tau_s, scene_tau_s, percent = (line[name] for name in _WORLD)
+    p, noise_m, tau_s, scene_tau_s, percent = (line[name] for name in _CONDITIONS)
     return StoredRow(
         line["method"],
         line["origin"],

@@ -18,7 +18,7 @@ from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.published import RATES_PERCENT
 from tint_sumo.study.results import GIVEN, Result
 
-WORLDS = {  # what can differ from the world of the training
+CONDITION_TITLES = {  # what can differ from the conditions of the training
     "position_noise_m": "noise on positions (m)",
     "tau_s": "headway tau of the drivers (s)",
     "percent": "part of the training (%)",
@@ -180,12 +180,12 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
 
 
 def at_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
-    """The rows of the main table: fully trained, the default world, one P(conservative) each."""
+    """The rows of the main table: fully trained, the default conditions, one P(conservative) each."""
     return [row for row in rows if row.conditions.is_single_mix]
 
 
 def over_all_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
-    """The rows of other worlds and parts of the training, where every case has a mix of its own."""
+    """The rows of other conditions and parts of the training, where every case has a mix of its own."""
     return [row for row in rows if not row.conditions.p_conservative.is_single]
 
 
@@ -204,7 +204,7 @@ def by_title(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
 
 
 def varied(rows: Sequence[AnyRow], name: str) -> dict[float, AnyRow]:
-    """The rows that differ from the world of the training in at most one condition, by its values in their order."""
+    """Return the rows that differ from the training in at most one condition, by its values in their order."""
     base = Conditions(rows[0].conditions.p_conservative)
     shown = [row for row in rows if replace(row.conditions, **{name: getattr(base, name)}) == base]
     return dict(sorted(((getattr(row.resolved, name), row) for row in shown), key=lambda pair: pair[0]))

@@ -10,7 +10,7 @@ import pandas as pd
 from tint_sumo.core.percentages import percent
 from tint_sumo.methods.registry import METHODS, Look, look_of
 from tint_sumo.study.jobs import smoothed_percent
-from tint_sumo.study.summary import WORLDS, Summary, by_title, varied
+from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, varied
 from tint_sumo.study.tables import Lines
 
 # Plotly's names for Matplotlib's markers and line styles.
@@ -96,10 +96,10 @@ def curve_chart(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Chart:
     return Chart("curves", "Success in training by decisions", lines, {"data": traces, "layout": layout})
 
 
-def world_charts(rows: Sequence[Summary]) -> list[Chart]:
-    """Success against each condition in which the rows differ from the training's world."""
+def condition_charts(rows: Sequence[Summary]) -> list[Chart]:
+    """Success against each condition in which the rows differ from the conditions of the training."""
     charts = []
-    for name, title in WORLDS.items():
+    for name, title in CONDITION_TITLES.items():
         traces, lines = [], [["method", title, "success %", "95 % interval"]]
         for method, own in by_title(rows).items():
             look = look_of(own[0].method)

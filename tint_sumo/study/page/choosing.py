@@ -40,7 +40,7 @@ class Choice:
 
 
 def choose(rows: Sequence[Row]) -> Choice:
-    """A world in which most policies were tested, the middle one of several, and cases that tell them apart."""
+    """Return the conditions in which most policies were tested, and cases in which their outcomes differ."""
     tested = at_mixes(rows) or over_all_mixes(rows)
     numbers = {one: sum(row.conditions == one for row in tested) for one in (row.conditions for row in tested)}
     common = [one for one, number in numbers.items() if number == max(numbers.values())]

@@ -20,7 +20,7 @@ from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import read_versions
 from tint_sumo.scenes import T_INTERSECTION, Scene, read_described, require_built_in
 from tint_sumo.study.jobs import read_curves
-from tint_sumo.study.page.charts import Chart, curve_chart, outcome_chart, world_charts
+from tint_sumo.study.page.charts import Chart, condition_charts, curve_chart, outcome_chart
 from tint_sumo.study.page.choosing import choose
 from tint_sumo.study.page.episodes import Recordings, failure_lists, player_data, player_notes, record_episodes
 from tint_sumo.study.page.findings import MEANING_OF_P, what_came_out
@@ -99,7 +99,7 @@ def _page(study: _Study) -> str:
     sections = [
         ("results", "Results", _results(study, charts)),
         ("curves", "Learning curves", _curves(study, charts)),
-        ("worlds", "Other worlds and shorter trainings", _worlds(study, charts)),
+        ("conditions", "Other conditions and shorter trainings", _conditions(study, charts)),
         ("player", "Episode player", _player(study)),
         ("failures", "Failures", _failures(study)),
         ("latents", "Latent space", _latents(study)),
@@ -167,12 +167,14 @@ def _curves(study: _Study, charts: list[Chart]) -> str:
     return _shown(study.curves, charts) + paragraph(note)
 
 
-def _worlds(study: _Study, charts: list[Chart]) -> str:
-    worlds = over_all_mixes(study.rows)
-    if not worlds:
-        return _left_out("the study tested its policies in the world of their training alone")
-    shown = [_shown(one, charts) for one in world_charts(worlds)]
-    return "".join([*shown, *(_table(one) for one in study.tables.values() if one.heading.startswith("Other worlds"))])
+def _conditions(study: _Study, charts: list[Chart]) -> str:
+    varied = over_all_mixes(study.rows)
+    if not varied:
+        return _left_out("the study tested its policies in the conditions of their training alone")
+    shown = [_shown(one, charts) for one in condition_charts(varied)]
+    return "".join(
+        [*shown, *(_table(one) for one in study.tables.values() if one.heading.startswith("Other conditions"))]
+    )
 
 
 def _player(study: _Study) -> str:

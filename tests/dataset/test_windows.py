@@ -41,8 +41,6 @@ from tint_sumo.dataset.windows import (
 from tint_sumo.simulation import SceneSimulation
 from tint_sumo.simulation.demand import PlacedVehicle
 
-NAN = np.nan
-
 
 def test_tracks_are_cut_into_windows_of_twenty_steps_and_remainders_of_at_least_two() -> None:
     steps = {3: 41, 5: 20, 8: 22, 9: 1}  # driver: track length
@@ -57,7 +55,7 @@ def test_tracks_are_cut_into_windows_of_twenty_steps_and_remainders_of_at_least_
 
 
 def test_every_driver_without_a_leader_gets_the_same_gap_and_larger_gaps_are_capped() -> None:
-    gap_m = np.array([3.0, 25.0, NAN, NAN])
+    gap_m = np.array([3.0, 25.0, np.inf, np.inf])
     windows = cut_windows(np.array([0, 0, 1, 1]), np.zeros(4, int), np.array([5.0, 6.0, 5.0, 6.0]), gap_m)
     assert windows.states[0, :2, 1].tolist() == [3.0, NO_LEADER_GAP_M]
     assert windows.states[1, :2, 1].tolist() == [NO_LEADER_GAP_M, NO_LEADER_GAP_M]
@@ -138,8 +136,7 @@ def test_drivers_that_move_alike_look_alike_whatever_their_trait() -> None:
             front_m[step] = simulation.slots.front_m[0, :2]
             gap_m[step] = simulation.leaders()[1][0, :2]
         simulation.close()
-        assert np.isinf(gap_m[:, 0]).all()  # the one ahead, whose gap is NaN in datasets
-        gap_m[:, 0] = np.nan
+        assert np.isinf(gap_m[:, 0]).all()  # the vehicle ahead
         np.testing.assert_allclose(gap_m[:, 1], 5.0, atol=1e-9)  # the one behind
         driver = np.repeat([0, 1], 20)
         tracks = [values.T.ravel() for values in (front_m, gap_m)]

@@ -28,7 +28,7 @@ class Seen(NamedTuple):
     """A vehicle on its route."""
 
     position_m: float
-    gap_m: float = math.nan
+    gap_m: float = math.inf
     passed: bool = False
 
 
@@ -276,7 +276,7 @@ def test_streaming_is_the_posterior_of_the_track_so_far() -> None:
     for slot, start, speed_m in ((3, 0, 0.2), (0, 13, 0.24)):
         for step in (start + 1, start + 19, start + 20, start + 21, start + 38):
             count = step - start + 1
-            gaps_m = np.full(count, np.nan) if slot == 3 else gap_m[start : step + 1]
+            gaps_m = np.full(count, np.inf) if slot == 3 else gap_m[start : step + 1]
             windows = cut_windows(np.zeros(count, int), np.zeros(count, int), speed_m * np.arange(count), gaps_m)
             expected = fuse_so_far(encode_windows(model, windows), windows.driver)
             np.testing.assert_allclose(traits[step, 0, slot, :2], expected.mean[-1], atol=2e-3)

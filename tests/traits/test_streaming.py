@@ -47,7 +47,7 @@ def test_a_stream_says_the_same_as_the_windows_of_the_tracks_so_far(steps: int) 
     model = load("cross_window")
     assert isinstance(model, CrossWindow)
     position_m = 7.0 + np.cumsum(np.random.default_rng(0).uniform(0.2, 0.3, (3, steps)), axis=1)
-    gap_m = np.broadcast_to([[6.0], [np.nan], [25.0]], (3, steps))
+    gap_m = np.broadcast_to([[6.0], [np.inf], [25.0]], (3, steps))
     stream, tracks = TrackStream(model, 3), np.arange(3)
     for step in range(steps):
         mean, std = stream.advance(tracks, position_m[:, step].astype(np.float32), gap_m[:, step])

@@ -89,8 +89,9 @@ def read_windows(folder: Path) -> Iterator[Windows]:
     manifest = read_manifest(folder)
     missing = manifest.windows
     for rows in read_shards(folder, TRAJECTORIES, manifest, ["episode", "vehicle", "position_m", "gap_m"]):
+        gap_m = rows["gap_m"].fillna(np.inf).to_numpy()  # in tables a missing leader is null
         windows = cut_windows(  # rows are sorted by episode, vehicle and time
-            _driver_numbers(rows), rows["episode"].to_numpy(), rows["position_m"].to_numpy(), rows["gap_m"].to_numpy()
+            _driver_numbers(rows), rows["episode"].to_numpy(), rows["position_m"].to_numpy(), gap_m
         )
         missing -= len(windows)
         if missing < 0:
@@ -118,14 +119,14 @@ def cut_windows(
     position_m: NDArray[np.floating],
     gap_m: NDArray[np.floating],
 ) -> Windows:
-    """Return the windows of rows (M,) that are sorted by driver and time; ``gap_m`` is NaN without a leader."""
+    """Return the windows of rows (M,) that are sorted by driver and time; ``gap_m`` is infinite without a leader."""
     first, length = window_rows(driver)
     valid = valid_steps(length)
     row = np.where(valid, first[:, None] + np.arange(WINDOW_STEPS), first[:, None])
     states = np.zeros((*valid.shape, 2), np.float32)
     states[..., 0] = position_m[row] - position_m[first, None]
     states[..., 1] = np.where(valid, capped(gap_m)[row], 0.0)
-    has_leader = ~np.isnan(gap_m)[row].any(axis=1)
+    has_leader = np.isfinite(gap_m)[row].all(axis=1)
     return Windows(states, length, driver[first], episode[first].astype(np.int64), has_leader)
 
 
@@ -153,8 +154,8 @@ def valid_steps(length: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def capped(gap_m: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return gaps to leaders, NaN without one, as trait models read them: 20 m at most, and 20 m without one."""
-    return np.asarray(np.fmin(gap_m, NO_LEADER_GAP_M))
+    """Return gaps to leaders, infinite without one, as trait models read them: 20 m at most."""
+    return np.asarray(np.minimum(gap_m, NO_LEADER_GAP_M))
 
 
 def joined(parts: Sequence[Windows]) -> Windows:

@@ -48,7 +48,7 @@ def infer_traits(
     trained, reach = load(model), read_card(model).input_range
     rows = read_tracks(source, net_file=net_file, vehicle_length_m=vehicle_length_m)
     track = rows["track"].to_numpy()
-    gap_m = rows["gap_m"].where(rows["gap_m"] < NO_LEADER_GAP_M).to_numpy()
+    gap_m = rows["gap_m"].where(rows["gap_m"] < NO_LEADER_GAP_M, np.inf).to_numpy()
     windows = cut_windows(track, np.zeros_like(track), rows["position_m"].to_numpy(), gap_m)
     if len(windows) == 0:
         raise InputError(f"{source} has no vehicle for {MIN_WINDOW_STEPS} steps of {STEP_S} s; write a longer run")

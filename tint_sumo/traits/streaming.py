@@ -87,7 +87,7 @@ class TrackStream:
         Args:
             tracks: (K,) their indices.
             along_m: (K,) position along the lane.
-            gap_m: (K,) to the leader, NaN without one.
+            gap_m: (K,) to the leader, infinite without one.
 
         Returns:
             Mean and standard deviation of their latents, each (K, latent_size).

@@ -65,13 +65,7 @@ def load_windows(folder: Path) -> Windows:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
     """
     count = read_manifest(folder).windows
-    whole = Windows(
-        np.empty((count, WINDOW_STEPS, 2), np.float32),
-        np.empty(count, np.int64),
-        np.empty(count, np.int64),
-        np.empty(count, np.int64),
-        np.empty(count, np.bool_),
-    )
+    whole = Windows(**{name: np.empty(count, _RECORD[name]) for name in _RECORD.names or ()})
     done = 0
     for part in read_windows(folder):
         for field in fields(Windows):

@@ -58,12 +58,12 @@ def test_a_film_shows_the_case_that_is_judged(name: str) -> None:
 
 def test_attention_and_traits_are_those_of_the_vehicles_that_are_there() -> None:
     for moment in moments("streaming_critic"):
-        assert moment.attention is not None and moment.told is not None
+        assert moment.attention is not None and moment.observed_traits is not None
         assert moment.attention.sum() == pytest.approx(1.0)
-        for values in (moment.attention[:, None], moment.told):
+        for values in (moment.attention[:, None], moment.observed_traits):
             assert not values[~moment.present].any()
         np.testing.assert_array_equal(moment.traits >= 0, moment.present)
-    assert all(moment.attention is None and moment.told is None for moment in moments("ttc"))
+    assert all(moment.attention is None and moment.observed_traits is None for moment in moments("ttc"))
 
 
 def test_only_those_that_slow_down_brake() -> None:
@@ -93,8 +93,8 @@ def test_what_policies_are_told_separates_the_traits() -> None:
     reader = fit_reader(load_policy("streaming_critic"))
     assert reader is not None and reader.has_spread
     moment = moments("streaming_critic")[100]
-    assert moment.told is not None
-    probability = reader.p_conservative(moment.told)[moment.present]
+    assert moment.observed_traits is not None
+    probability = reader.p_conservative(moment.observed_traits)[moment.present]
     np.testing.assert_array_equal(probability > 0.5, moment.traits[moment.present] == 0)
     assert fit_reader(load_policy("no_labels")) is None
     assert fit_reader(load_policy("ttc")) is None
@@ -107,10 +107,14 @@ def test_fills_are_inferred_traits_and_outlines_true_ones() -> None:
     outlines = count(plain, BLUE), count(plain, RED)
     assert all(outlines)
     told = np.where(moment.present[:, None], 1.0, 0.0)
-    all_blue = artist("ttc", TraitReader(np.array([99.0]), 0.0, has_spread=False)).frame(replace(moment, told=told))
+    all_blue = artist("ttc", TraitReader(np.array([99.0]), 0.0, has_spread=False)).frame(
+        replace(moment, observed_traits=told)
+    )
     assert count(all_blue, BLUE) > outlines[0] + 300 * moment.present.sum()
     assert count(all_blue, RED) == pytest.approx(outlines[1], rel=0.05)
-    unsure = artist("ttc", TraitReader(np.array([0.0]), 0.0, has_spread=False)).frame(replace(moment, told=told))
+    unsure = artist("ttc", TraitReader(np.array([0.0]), 0.0, has_spread=False)).frame(
+        replace(moment, observed_traits=told)
+    )
     assert count(unsure, (190, 190, 190)) > 300 * moment.present.sum()
 
 

@@ -104,7 +104,7 @@ def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -
         boxes=boxes,
         brakes=np.array([False, True]),
         traits=np.array([0, 1]),
-        told=told,
+        observed_traits=told,
         attention=np.array([0.75, 0.25]),
         claimed=np.array([False, True]),
         desired_mps=3.0,
@@ -143,7 +143,7 @@ def test_an_episode_survives_its_small_numbers() -> None:
 
 
 def test_rules_have_no_value_no_attention_and_nothing_inferred() -> None:
-    bare = [replace(moment([1, 2], 0.0, "timeout"), value=None, attention=None, told=None)]
+    bare = [replace(moment([1, 2], 0.0, "timeout"), value=None, attention=None, observed_traits=None)]
     episode = encode(bare, None, ["lower", "upper"])
     assert "value" not in episode["ego"]
     assert not {"attention", "p_conservative"} & set(episode["vehicles"][0])

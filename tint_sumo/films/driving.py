@@ -1,4 +1,4 @@
-"""One case, step by step, with all that a film shows of it."""
+"""Drive one case step by step, and keep all that a film shows."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _BRAKING_MPS2 = 0.5  # vehicles that slow down by more than this show it
 
 @dataclass(frozen=True)
 class Moment:
-    """What there is to see after a step of the simulation; V vehicle slots, K routes of the traffic."""
+    """The visible state after a step of the simulation; V vehicle slots, K routes of the traffic."""
 
     time_s: float
     ego: np.void  # box of the ego
@@ -34,16 +34,16 @@ class Moment:
     boxes: Boxes  # (V,)
     brakes: Bools  # (V,)
     traits: Numbers  # (V,) true ones: numbers of profiles, -1 in empty slots
-    told: Floats | None  # (V, Z) traits as the policy is told them
+    observed_traits: Floats | None  # (V, Z) traits in the policy's observation
     attention: Floats | None  # (V,)
     claimed: Bools  # (K,)
     desired_mps: float | None  # the policy's action; None before its first
-    value: float | None  # what the policy expected when it chose the action
+    value: float | None  # return that the policy expected when it chose the action
     outcome: str  # empty until the end
 
 
 class _Driver:
-    """The policy and what it remembers."""
+    """A policy with its recurrent state."""
 
     def __init__(self, contender: Contender) -> None:
         self._policy = contender.policy
@@ -53,7 +53,7 @@ class _Driver:
         self._starts = np.ones(1, bool)
 
     def act(self, observation: dict[str, NDArray[Any]], traits: Numbers) -> tuple[int, float | None]:
-        """The likeliest action, and the value that is expected."""
+        """Return the likeliest action, and the expected return."""
         value = None if self._network is None else self._value(self._network, observation, traits)
         actions, self._state = self._policy.predict(
             observation, state=self._state, episode_start=self._starts, deterministic=True
@@ -72,12 +72,12 @@ class _Driver:
         return float(network.predict_values(tensors, states, torch.as_tensor(self._starts, device=device)))
 
     def attention(self, observation: dict[str, NDArray[Any]]) -> Floats | None:
-        """(V,) weights of the vehicles; None without a network."""
+        """Return the weights of the vehicles (V,); None without a network."""
         return None if self._network is None else self._network.attention_weights(observation)[0].astype(np.float64)
 
 
 class _Stage:
-    """The environment of one case, and the traits that the policy is told."""
+    """The environment of one case, with the source of the traits in its observation."""
 
     def __init__(self, contender: Contender, task: dict[str, Any]) -> None:
         source: TraitSource | None = None if contender.source is None else contender.source()
@@ -107,13 +107,13 @@ class _Stage:
 
     @property
     def observation(self) -> dict[str, NDArray[Any]]:
-        """Of a batch of one, with the traits."""
+        """The observation as a batch of one, with the traits."""
         traits = {} if self.source is None else {TRAITS: self.source.traits.copy()}
         return {**self.frame.observation, **traits}
 
 
 class _Speeds:
-    """Who brakes, from where all are at each step."""
+    """Speeds between two steps, which show who brakes."""
 
     def __init__(self, simulation: SceneSimulation) -> None:
         self._simulation = simulation
@@ -124,7 +124,7 @@ class _Speeds:
         self._ego_mps = 0.0
 
     def brakes(self) -> tuple[Bools, bool]:
-        """Of the vehicles (V,), and of the ego, in the step just made."""
+        """Return whether the vehicles (V,) and the ego have braked in the last step."""
         slots = self._simulation.slots
         stays = slots.present[0] & (slots.vehicle_number[0] == self._who)
         mps = np.where(stays, (slots.front_m[0] - self._front_m) / self._step_s, np.nan)
@@ -137,7 +137,7 @@ class _Speeds:
 
 
 def drive_case(contender: Contender, case: int, seed: int, **task: Any) -> Iterator[Moment]:
-    """Every simulation step of case ``case`` of the set ``seed``, the beginning included; ``task`` as in ``SceneEnv``.
+    """Yield the beginning and every step of case ``case`` of the set ``seed``; ``task`` as in ``SceneEnv``.
 
     The case goes as it does in ``tint_sumo.methods.evaluation.evaluate``: the policy decides every
     ``action_repeat`` steps.
@@ -173,7 +173,7 @@ def _moment(stage: _Stage, driver: _Driver, speeds: _Speeds, desired_mps: float 
         boxes=slots.box[0].copy(),
         brakes=brakes,
         traits=stage.info["traits"].astype(np.int64),
-        told=observation[TRAITS][0].astype(np.float64) if TRAITS in observation else None,
+        observed_traits=observation[TRAITS][0].astype(np.float64) if TRAITS in observation else None,
         attention=driver.attention(observation),
         claimed=stage.simulation.yielding.has_claimed[0].copy(),
         desired_mps=desired_mps,

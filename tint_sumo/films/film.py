@@ -29,7 +29,7 @@ _LAST_S = 1.5  # a film shows its last moment for so long
 
 @dataclass(frozen=True)
 class Film:
-    """What a film shows."""
+    """The outcome of the case, and the size of the film."""
 
     outcome: str
     time_s: float
@@ -56,7 +56,7 @@ def render_case(
         out: .mp4, .gif or .png file.
         seed: which set of cases, 0 to 1000.
         p_conservative: as in ``SceneEnv``; that of the contender if not given.
-        report: told of the progress.
+        report: called with the progress.
         task: as in ``SceneEnv``; the scene is the contender's.
 
     Raises:
@@ -80,7 +80,7 @@ def render_case(
 
 
 def require_film_scene(contender: Contender) -> Scene:
-    """The contender's scene; InputError unless a film can show it."""
+    """Return the contender's scene; InputError unless a film can show it."""
     return require_built_in("a film", contender.scene, profiles=2)
 
 
@@ -95,7 +95,7 @@ def require_film_file(out: Path) -> None:
 
 
 def _spread(moments: Sequence[Moment]) -> list[Moment]:
-    """As many as a strip shows, evenly spread, the first and the last among them."""
+    """Return as many moments as a strip shows, evenly spread, the first and the last among them."""
     across, down = _STRIP
     return [moments[index] for index in np.linspace(0, len(moments) - 1, across * down).round().astype(int).tolist()]
 
@@ -131,7 +131,7 @@ def _write_gif(file: Path, artist: Artist, moments: Sequence[Moment], report: Re
 
 
 def _palette(artist: Artist, moments: Sequence[Moment]) -> Image.Image:
-    """The colours of the first, a middle and the last moment."""
+    """Return the colours of the first, a middle and the last moment."""
     chosen = (moments[0], moments[len(moments) // 2], moments[-1])
     return Image.fromarray(np.concatenate([np.asarray(artist.frame(moment)) for moment in chosen])).quantize()
 

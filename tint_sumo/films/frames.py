@@ -1,4 +1,4 @@
-"""The frames of a film: the scene from above, and what the policy makes of it."""
+"""Frames of a film: the scene from above, with the inferred traits and the attention of the policy."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -37,11 +37,11 @@ class Artist:
     layout: Layout
     title: str  # what drives where
     colour: Colour  # of the method, as in all figures
-    reader: TraitReader | None  # None where the policy is told no traits
+    reader: TraitReader | None  # None without traits in the observation
     has_attention: bool
 
     def frame(self, moment: Moment) -> Image.Image:
-        """An RGB image of ``SIZE_PX``."""
+        """Return an RGB image of ``SIZE_PX``."""
         image = self._paper.copy()
         image.paste(self._scene(moment), (0, _TITLE_HEIGHT_PX))
         self._write(ImageDraw.Draw(image), moment)
@@ -66,13 +66,13 @@ class Artist:
         return canvas.drawing.reduce(_OVERSAMPLING)
 
     def _fills(self, moment: Moment) -> list[Colour]:
-        """Of each slot: the colour of the likelier trait, the greyer the less sure; white where nothing is inferred."""
-        if self.reader is None or moment.told is None:
+        """Return the colour of each slot's likelier trait, the greyer the less sure; white where none is inferred."""
+        if self.reader is None or moment.observed_traits is None:
             return [_WHITE] * len(moment.present)
         conservative, aggressive = (_parts(profile.colour) for profile in self.layout.scene.population.profiles)
         return [
             _WHITE if np.isnan(probability) else _shade(probability, conservative, aggressive)
-            for probability in self.reader.p_conservative(moment.told).tolist()
+            for probability in self.reader.p_conservative(moment.observed_traits).tolist()
         ]
 
     def _draw_vehicle(self, canvas: Canvas, pose: np.void, outline: Colour, fill: Colour, brakes: bool) -> None:
@@ -97,7 +97,7 @@ class Artist:
 
     @cached_property
     def _paper(self) -> Image.Image:
-        """What no moment changes: the title, and what the colours mean."""
+        """Draw the title and the legend, which are the same in all moments."""
         image = Image.new("RGB", SIZE_PX, _PAPER)
         draw, top = ImageDraw.Draw(image), SIZE_PX[1] - 46
         draw.rectangle((10, 8, 24, 22), fill=self.colour)
@@ -111,7 +111,7 @@ class Artist:
             _key(draw, (left, top), "attention", fill=_HALO_KEY)
         below = top + 22
         if self.reader is None:
-            draw.text((10, below), "nobody tells this policy the others' traits", font=_font(13), fill=_FAINT)
+            draw.text((10, below), "this policy has no traits of the others", font=_font(13), fill=_FAINT)
             return image
         left = _key(draw, (10, below), f"inferred trait: {first.name}", fill=_parts(first.colour))
         left = _key(draw, (left, below), second.name, fill=_parts(second.colour))
@@ -121,7 +121,7 @@ class Artist:
 
 
 def _wanted(moment: Moment) -> str:
-    """What the policy does."""
+    """Draw the action and the value of the policy."""
     parts = [f"speed {moment.ego_mps:.1f} m/s"]
     if moment.desired_mps is not None:
         parts.append(f"action: wants {moment.desired_mps:g} m/s")
@@ -131,7 +131,7 @@ def _wanted(moment: Moment) -> str:
 
 
 def _noticed(layout: Layout, moment: Moment) -> str:
-    """What the ego's control and its claims are."""
+    """Draw the state of the ego's safety check and its claims."""
     claims = [route.name for route, claimed in zip(layout.scene.routes, moment.claimed, strict=True) if claimed]
     text = f"claims {' and '.join(claims)}" if claims else "claims no lane"
     return text + ("     held by the safety check" if moment.is_held else "")
@@ -145,7 +145,7 @@ def _key(
     outline: Colour | None = None,
     fill: Colour | None = None,
 ) -> int:
-    """One entry of the legend; where the next one begins."""
+    """Draw an entry of the legend, and return where the next one begins."""
     left, top = at
     draw.rectangle((left, top + 2, left + 18, top + 13), outline=outline or fill, fill=fill, width=3)
     draw.text((left + 23, top), text, font=_font(13), fill=_INK)
@@ -153,7 +153,7 @@ def _key(
 
 
 def _draw_lamp(canvas: Canvas, pose: np.void, back_m: float, across_m: tuple[float, float]) -> None:
-    """A brake light behind a vehicle."""
+    """Draw the brake lights of a vehicle."""
     right_m, left_m = across_m
     canvas.draw.polygon(canvas.part(pose, (back_m - _LAMP_M - _EDGE_M, back_m + _EDGE_M), across_m), fill=_WHITE)
     inside_m = (right_m + _EDGE_M, left_m - _EDGE_M)
@@ -161,7 +161,7 @@ def _draw_lamp(canvas: Canvas, pose: np.void, back_m: float, across_m: tuple[flo
 
 
 def _draw_halo(canvas: Canvas, pose: np.void, weight: float) -> None:
-    """A disc whose area grows with the weight."""
+    """Draw a disc whose area grows with the weight."""
     if weight < LEAST_WEIGHT:
         return
     ((across, down),) = canvas.pixels(np.array([[pose["x_m"], pose["y_m"]]]))
@@ -189,7 +189,7 @@ def _font(size_px: int) -> ImageFont.FreeTypeFont:
 
 @cache
 def _view(layout: Layout) -> View:
-    """The scene's own view, with more around it where a frame has room."""
+    """Return the scene's view, with more around it where a frame has room."""
     own = layout.scene.view
     width_m, height_m = own.right_m - own.left_m, own.top_m - own.bottom_m
     m_per_px = max(width_m / SIZE_PX[0], height_m / _SCENE_HEIGHT_PX)
@@ -200,7 +200,7 @@ def _view(layout: Layout) -> View:
 
 @cache
 def _roads(layout: Layout) -> Image.Image:
-    """The empty roads with the ego's way; not to be drawn on."""
+    """Return the empty roads with the ego's way; not to be drawn on."""
     roads = background(layout.roads, _view(layout), SIZE_PX[0], _OVERSAMPLING).copy()
     canvas = Canvas(_view(layout), roads, width_px=SIZE_PX[0], oversampling=_OVERSAMPLING)
     task = layout.scene.ego
@@ -211,13 +211,13 @@ def _roads(layout: Layout) -> Image.Image:
 
 @cache
 def _lanes(layout: Layout) -> tuple[shapely.Geometry, ...]:
-    """The area of each of the traffic's routes."""
+    """Return the area of each route of the traffic."""
     half_m = layout.scene.network.lane_width_m / 2
     lines = [shapely.linestrings(_between(path.way, 0.0, path.length_m)) for path in layout.routes]
     return tuple(shapely.buffer(line, half_m, cap_style="flat") for line in lines)
 
 
 def _between(way: Floats, from_m: float, to_m: float) -> Floats:
-    """A tenth of the points of a part of a way."""
+    """Return a tenth of the points of a part of a way."""
     part: Floats = way[round(from_m / SPACING_M) : round(to_m / SPACING_M) : 10]
     return part

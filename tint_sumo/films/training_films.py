@@ -13,7 +13,7 @@ CASE = 1  # always the same one, which no policy is trained on
 
 
 def film_policy(policy: Path) -> bytes | None:
-    """A GIF of the policy in this file in one case; None in scenes that films cannot show.
+    """Return a GIF of the policy in this file in one case; None in scenes that films cannot show.
 
     It draws no random numbers of the training's. Where the training holds libsumo, the case runs through TraCI.
     """

@@ -291,7 +291,7 @@ def _vehicle(
         columns["attention"] = [moment.attention[slot] for moment in own if moment.attention is not None]
     if reader is not None:
         columns["p_conservative"] = reader.p_conservative(
-            np.array([moment.told[slot] for moment in own if moment.told is not None])
+            np.array([moment.observed_traits[slot] for moment in own if moment.observed_traits is not None])
         )
     return {
         "number": int(number),

@@ -49,10 +49,11 @@ SEED = 0  # of samples
 SLOWEST_S = 10.0  # a mutant may take so much longer than the code, and three times as long
 
 TESTS = {  # by the module that is broken
-    "simulation/yielding": "tests/simulation/test_yielding.py -k told",
+    "simulation/yielding": "tests/simulation/test_yielding.py",
     "simulation/ego": "tests/simulation/test_ego.py",
     "simulation/demand": "tests/simulation/test_demand.py",
     "simulation/slots": "tests/simulation/test_slots.py",
+    "simulation/lanes": "tests/simulation/test_lanes.py",
     "envs/rows": "tests/envs/test_rows.py",
     "envs/episodes": "tests/envs/test_episodes.py",
     "dataset/windows": "tests/dataset/test_windows.py",

@@ -1,4 +1,4 @@
-"""Environments in a batch, whose episodes follow one another."""
+"""Batches of environments, whose episodes follow one another."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ _ACTION = np.int8  # has room for MOST_ACTIONS
 
 @dataclass(frozen=True)
 class Ended:
-    """How an environment's episode ended."""
+    """The end of an environment's episode."""
 
     index: int
     row: np.void  # its last row
@@ -59,27 +59,27 @@ def checked_snapshots(snapshots: Any, tasks: Sequence[str]) -> list[Snapshot]:
 class Batch(Protocol):
     """Environments that step together.
 
-    What follows an episode's end is said by a mode, with the meanings of gymnasium's vector environments: the next
-    episode begins in the same step (``SAME_STEP``), in the next one instead of the action (``NEXT_STEP``), or with the
-    next reset (``DISABLED``); until then the environment's row shows how the episode ended.
+    The mode, one of gymnasium's vector environments, says when the next episode begins after an episode's end: in the
+    same step (``SAME_STEP``), in the next one instead of the action (``NEXT_STEP``), or with the next reset
+    (``DISABLED``); until then the environment's row is that of the end.
     """
 
-    rows: Rows  # (N,) what the environments tell; written anew by each call
+    rows: Rows  # (N,) of the environments; written by each call
 
     def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> None:
         """Start a new episode where the mask (N,) is true; without a seed, from the environment's own generator."""
 
     def step(self, actions: NDArray[np.integer]) -> list[Ended]:
-        """Take valid actions (N,); the episodes that have ended. With ``DISABLED`` none may have ended before."""
+        """Take valid actions (N,); return the episodes that ended. With ``DISABLED`` none may have ended before."""
 
     def park(self, mask: NDArray[np.bool_]) -> None:
         """Empty the environments where the mask (N,) is true: they cost next to nothing until their next reset."""
 
     def snapshot(self) -> list[Snapshot]:
-        """Where each environment is; all have been reset, and none is parked."""
+        """Return a snapshot of each environment; all have been reset, and none is parked."""
 
     def restore(self, snapshots: Sequence[Snapshot]) -> None:
-        """Bring each environment to where one was."""
+        """Replay the episodes of snapshots, one in each environment."""
 
     def render(self) -> list[NDArray[np.uint8]]: ...
 
@@ -129,7 +129,7 @@ class LocalBatch:
         return ended
 
     def _over(self) -> list[int]:
-        """Environments whose episode has ended and whose next one has not begun."""
+        """Return the environments whose episode has ended and whose next one has not begun."""
         over: list[int] = np.flatnonzero(self.rows["outcome"]).tolist()
         return over
 
@@ -148,7 +148,7 @@ class LocalBatch:
         ]
 
     def restore(self, snapshots: Sequence[Snapshot]) -> None:
-        """All episodes are simulated once more, and begin such that they arrive together."""
+        """Simulate all episodes once more; they begin such that they end together."""
         self.park(np.ones(len(snapshots), bool))
         for left in range(max(len(one.actions) for one in snapshots), -1, -1):
             for index, one in enumerate(snapshots):

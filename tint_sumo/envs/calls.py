@@ -97,7 +97,7 @@ def checked_seed(seed: Any) -> int | None:
 
 
 def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
-    """Return a seed for each environment: one number stands for itself and those that follow.
+    """Return a seed for each environment: one number stands for itself and those after it.
 
     Raises:
         InputError: there are not as many as environments, or one is no seed.

@@ -1,4 +1,4 @@
-"""Episodes of the navigation task in a batch of intersections: what all environment classes share."""
+"""Episodes of the navigation task in a batch of intersections, as all environment classes have them."""
 
 import hashlib
 import math
@@ -112,12 +112,12 @@ class TaskSettings:
 
     @property
     def slot_infos(self) -> tuple[str, ...]:
-        """What is told of each vehicle slot beside the observation."""
+        """Fields of the infos that have a value for each vehicle slot."""
         return ("traits", *TRACKS) if self.tracks else ("traits",)
 
     @cached_property
     def played(self) -> Scene | SumocfgScene:
-        """The scene with these settings in place of its own."""
+        """The scene with these settings."""
         scene = find_scene(self.scene).with_drivers(self.p_conservative, self.tau_s)
         limit_s = scene.time_limit_s if self.time_limit_s is None else self.time_limit_s
         if self.max_episode_steps is not None:
@@ -151,7 +151,7 @@ def observation_space(max_vehicles: int) -> spaces.Dict:
 
 
 def episode_seed(rng: np.random.Generator) -> int:
-    """Seed of the next episode of an environment with this generator."""
+    """Return the seed of the next episode of an environment with this generator."""
     return int(rng.integers(_SEED_LIMIT))
 
 
@@ -159,7 +159,7 @@ class Episodes:
     """``num_envs`` episodes at a time, each in its own replica with its own random stream.
 
     Args:
-        rows: (N,) what the environments tell is written there; new if none is given.
+        rows: (N,) written at each step; new if none are given.
     """
 
     def __init__(self, num_envs: int, settings: TaskSettings, rows: Rows | None = None) -> None:
@@ -179,7 +179,7 @@ class Episodes:
         self._noise_m: Floats = np.zeros((num_envs, scene.max_vehicles, 2))
 
     def begin(self, index: int, rng: np.random.Generator) -> None:
-        """Start a new episode drawn from an environment's generator; nothing is left of the one before."""
+        """Start a new episode, whose seed is drawn from an environment's generator."""
         seed = episode_seed(rng)
         self.simulation.reset(index, seed)
         self._parked.discard(index)
@@ -221,7 +221,7 @@ class Episodes:
         return any_ended
 
     def _step(self, desired_mps: Floats) -> bool:
-        """Simulate one step; whether any episode has ended."""
+        """Simulate one step; return whether any episode has ended."""
         simulation = self.simulation
         if self._parked:
             parked = list(self._parked)
@@ -270,7 +270,7 @@ class Episodes:
         )
 
     def collision_info(self, index: int) -> dict[str, Any]:
-        """Who was hit where; empty if the episode has not ended with a collision."""
+        """Return the other driver and the site of a collision; empty if the episode has not ended with a collision."""
         event = self.simulation.egos.collision[index]
         if event is None or self.rows["outcome"][index] != COLLISION:
             return {}

@@ -54,7 +54,7 @@ def background(roads: Roads, view: View, width_px: int = _WIDTH, oversampling: i
 
 
 class Canvas:
-    """A top view in metres, drawn ``oversampling`` times as large as it is wanted; colours may have an opacity."""
+    """A top view in metres, drawn ``oversampling`` times as large as the image; colours may have an opacity."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""What each environment has to tell after a step: one record, written by compiled code."""
+"""The record of an environment after a step, written by compiled code: observation, infos, rewards and outcome."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ Rows = NDArray[np.void]  # records (N,) of a row type
 
 
 def row_type(max_vehicles: int) -> np.dtype[np.void]:
-    """What one environment tells of itself and of so many vehicle slots."""
+    """Return the type of an environment's record, with so many vehicle slots."""
     slots = (max_vehicles,)
     layout = np.dtype(
         [
@@ -93,7 +93,7 @@ def end_info(outcome: str, collision: dict[str, Any]) -> dict[str, Any]:
 
 
 class TaskRules(NamedTuple):
-    """When an episode ends, and what a step is worth."""
+    """The numbers by which an episode ends, and the rewards of a step."""
 
     goal_m: float  # the ego's front past it is a success
     step_limit: int
@@ -116,7 +116,7 @@ class TaskRules(NamedTuple):
 
 @compiled
 def judge(front_m: Floats, speed_mps: Floats, collided: Bools, steps: Numbers, rules: TaskRules, rows: Rows) -> bool:
-    """Write outcomes and rewards of the step just made (paper IV-A); whether any episode has ended.
+    """Write outcomes and rewards of the step just made (paper IV-A); return whether any episode has ended.
 
     Args:
         front_m, speed_mps, collided: (N,) of the egos.
@@ -144,9 +144,9 @@ def judge(front_m: Floats, speed_mps: Floats, collided: Bools, steps: Numbers, r
 
 @compiled
 def add_up(before: Rows, rows: Rows) -> None:
-    """Make rows of a step those of all steps of a decision so far.
+    """Add the rows of a decision's earlier steps to those of this step.
 
-    Rewards and their terms are summed up. Where an episode had ended already, the row stays as it was then.
+    Rewards and their terms are summed up. Rows of episodes that had ended already stay as they were.
 
     Args:
         before: (N,) rows of the decision's steps before this one.
@@ -165,7 +165,7 @@ def add_up(before: Rows, rows: Rows) -> None:
 
 
 class Scales(NamedTuple):
-    """What observations are divided by, and the length of a step."""
+    """The units of observations, and the length of a step."""
 
     position_m: float
     speed_mps: float
@@ -229,7 +229,7 @@ def observe_tracks(
     noise_m: Floats,
     rows: Rows,
 ) -> None:
-    """Write where the vehicles are seen on their routes, with the same noise as in the observations.
+    """Write the observed positions of vehicles on their routes, with the same noise as in the observations.
 
     Args:
         ego_front_m: (N,).
@@ -240,18 +240,18 @@ def observe_tracks(
     for index in range(len(rows)):
         row = rows[index]
         for slot in range(present.shape[1]):
-            there, own, ahead = present[index, slot], vehicles[index, slot], leader[index, slot]
-            own_noise_m = noise_m[index, slot, 0] * own.heading_x + noise_m[index, slot, 1] * own.heading_y
-            row.position_m[slot] = front_m[index, slot] + own_noise_m if there else 0.0
+            there, this, ahead = present[index, slot], vehicles[index, slot], leader[index, slot]
+            noise_along_m = noise_m[index, slot, 0] * this.heading_x + noise_m[index, slot, 1] * this.heading_y
+            row.position_m[slot] = front_m[index, slot] + noise_along_m if there else 0.0
             row.gap_m[slot] = math.inf
             if ahead >= 0:
                 other = vehicles[index, ahead]
-                row.gap_m[slot] = gap_m[index, slot] - own_noise_m
+                row.gap_m[slot] = gap_m[index, slot] - noise_along_m
                 row.gap_m[slot] += noise_m[index, ahead, 0] * other.heading_x
                 row.gap_m[slot] += noise_m[index, ahead, 1] * other.heading_y
             row.passed[slot] = there and ego_front_m[index] > passed_m[route[index, slot]]
 
 
 def copied(rows: Rows) -> dict[str, NDArray[Any]]:
-    """Arrays (N, ...) of their own for each field."""
+    """Return a copy of each field, (N, ...)."""
     return {field: rows[field].copy() for field in rows.dtype.names or ()}

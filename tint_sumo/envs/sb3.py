@@ -82,11 +82,11 @@ class SceneVecEnv(VecEnv):
         return observation_of(rows), rows["reward"].astype(np.float32), done, listed
 
     def snapshot(self) -> list[Snapshot]:
-        """As in ``SceneVectorEnv``."""
+        """Return snapshots, as ``SceneVectorEnv`` does."""
         return self.env.snapshot()
 
     def restore(self, snapshots: Sequence[Snapshot]) -> VecEnvObs:
-        """As in ``SceneVectorEnv``; the observation there."""
+        """Go back, as ``SceneVectorEnv`` does; return the observation there."""
         observation, infos = self.env.restore(snapshots)
         self._keep_slots(infos)
         return observation
@@ -110,7 +110,7 @@ class SceneVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **kwargs: Any,  # noqa: ARG002
     ) -> list[Any]:
-        """``"park"`` alone: empty environments, so that they cost next to nothing until the next reset of all."""
+        """Call ``"park"``, the only method: empty environments, which cost next to nothing until the next reset."""
         if method_name != "park":
             raise NotImplementedError("the environments share one simulation and have no methods of their own but park")
         parked = list(self._get_indices(indices))

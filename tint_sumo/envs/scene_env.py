@@ -96,13 +96,13 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * `position_noise_m`: standard deviation of the noise on the others' x and y, independent per vehicle and step.
     * `tau_s`: time headway of the others' car following (SUMO's `tau`); default the scene's, 1 s in the built-in
       ones.
-    * `tracks`: tell in the infos, too, where vehicles are seen on their routes, with the same noise as in the
-      observations; that is what trait models take. Default False.
+    * `tracks`: the infos contain the observed positions of vehicles on their routes, too, with the same noise as in
+      the observations; trait models take them. Default False.
     * `decision_s`: an action holds for so long, a multiple of the simulation's step (0.1 s in the built-in scenes), or
       until the episode ends. A step of the environment then is so many steps of the simulation, at each of which the
       controller and its safety check work; `reward` and `reward_terms` are their sums, and everything else is as after
       the last of them. Default: one step of the simulation. Policies with traits look at every step of the simulation;
-      they take `tint_sumo.policy.ActionRepeat` instead, which tells how it differs.
+      they take `tint_sumo.policy.ActionRepeat` instead, whose docstring says how it differs.
     * `backend`: `"libsumo"`, `"traci"` (a sumo subprocess), or `"auto"` (default): libsumo if neither another
       environment nor your own program uses it in this process, since libsumo holds one simulation per process.
     * `render_mode`: `None`, `"rgb_array"`, or `"human"`: a window follows the episodes in real time. It needs a
@@ -148,7 +148,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How gymnasium made the environment, with the length of its longest episode, which some wrappers ask for."""
+        """Gymnasium's specification of the environment, with the length of its longest episode, for wrappers."""
         return self._spec
 
     @spec.setter
@@ -210,11 +210,11 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     @property
     def simulation(self) -> Simulation:
-        """What is simulated, to be looked at only; the environment is its replica 0."""
+        """The simulation, which is read only; the environment is its replica 0."""
         return self._episodes.simulation
 
     def snapshot(self) -> Snapshot:
-        """What ``restore`` needs to come back to where the episode is now; it can be pickled.
+        """Return what ``restore`` needs to come back to this step of the episode; it can be pickled.
 
         Raises:
             InputError: no episode has begun.
@@ -223,9 +223,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         return Snapshot(self._began, tuple(self._actions), self._settings.fingerprint)
 
     def restore(self, snapshot: Snapshot) -> tuple[Observation, dict[str, Any]]:
-        """Go back, or to another environment's episode with the same arguments; the observation and info there.
+        """Replay an episode of this environment, or of one with the same arguments; return observation and info there.
 
-        The episode is simulated once more up to there, which takes as long as it took: SUMO's own saved states do not
+        The episode is simulated once more, which takes as long as it took: SUMO's own saved states do not
         hold all that its vehicles remember, and would not go on to the last bit as the episode did.
 
         Raises:
@@ -239,12 +239,12 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         return self._shown()
 
     def _shown(self) -> tuple[Observation, dict[str, Any]]:
-        """The observation and info where the episode is."""
+        """Return the observation and info of the present step."""
         fields = fields_of(self._episodes.rows)
         return _observation(fields), start_info(fields, self._slot_infos)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(H, W, 3) image of the scene; conservative drivers blue, aggressive red, the ego yellow.
+        """Return an (H, W, 3) image of the scene; conservative drivers blue, aggressive red, the ego yellow.
 
         None with ``render_mode="human"``, where the window follows by itself.
         """

@@ -39,7 +39,7 @@ from tint_sumo.envs.rows import (
 from tint_sumo.envs.workers import WorkerBatch, shares_of
 from tint_sumo.scenes import T_INTERSECTION, AnyScene
 
-MOST_ENVS = 100_000  # environments of one vector: beyond, memory would run out before anything is said
+MOST_ENVS = 100_000  # environments of one vector; memory would not do for more
 
 
 class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
@@ -167,7 +167,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return observation_of(rows), rows["reward"], rows["terminated"], rows["truncated"], infos
 
     def advance(self, actions: NDArray[np.int64]) -> tuple[dict[str, NDArray[Any]], list[Ended]]:
-        """Take a step; the fields of all rows after it, and the episodes that ended in it.
+        """Take a step; return the fields of all rows after it, and the episodes that ended in it.
 
         Rewards, terminations and truncations are those of the step, all else is as it is now.
         """
@@ -192,7 +192,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         ]
 
     def snapshot(self) -> list[Snapshot]:
-        """What ``restore`` needs to come back to where the episodes are now, as in ``SceneEnv``; it can be pickled.
+        """Return what ``restore`` needs to come back to these steps of the episodes; it can be pickled.
 
         Raises:
             InputError: no episodes have begun.
@@ -202,7 +202,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             return self.batch.snapshot()
 
     def restore(self, snapshots: Sequence[Snapshot]) -> tuple[Observation, dict[str, Any]]:
-        """Go back, or to the episodes of another vector with the same arguments; the observation and infos there.
+        """Replay episodes of this vector, or of one with the same arguments; return observation and infos there.
 
         It takes as long as the longest episode so far.
 
@@ -224,12 +224,12 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             self.batch.park(mask)
 
     def _shown(self, mask: NDArray[np.bool_] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """The observation where the environments are, and the infos of those in the mask, by default of all."""
+        """Return the observation of the present steps, and the infos of the environments in the mask, or of all."""
         rows = copied(self.batch.rows)
         return observation_of(rows), self._infos(rows, mask)
 
     def _infos(self, rows: dict[str, NDArray[Any]], mask: NDArray[np.bool_] | None = None) -> dict[str, Any]:
-        """The infos of the environments in a mask, by default of all; gymnasium has 0 or None elsewhere."""
+        """Return the infos of the environments in a mask, or of all; 0 or None elsewhere, as gymnasium has it."""
         infos = {**{key: rows[key] for key in self.slot_infos}, "outcome": outcome_names(rows["outcome"])}
         infos["time_s"] = rows["time_s"]
         if mask is None:
@@ -246,7 +246,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         return {"final_obs": observation_of(last), "final_info": step_info(last, self.slot_infos, ended.collision)}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """One (H, W, 3) image per environment."""
+        """Return an (H, W, 3) image per environment."""
         self._calls.require_episode()
         if self.render_mode is None:
             return None
@@ -281,5 +281,5 @@ def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
 
 
 def _masked(values: dict[str, Any], mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """Gymnasium's vector infos: each key has a twin ``_key`` that tells where it holds."""
+    """Return infos as gymnasium's vectors have them: each key has a twin ``_key``, true where it holds."""
     return {**values, **{f"_{key}": mask for key in values}}

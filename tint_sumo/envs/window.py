@@ -1,6 +1,7 @@
 """A window on the screen that follows an environment, for ``render_mode="human"``.
 
-It is made with tkinter, which comes with Python, so that watching needs no further package.
+It is made with tkinter, which comes with Python. Gymnasium's ``HumanRendering`` would need pygame, could not be closed
+by hand without ending the episodes, and could not be copied along with an environment.
 """
 
 import os
@@ -20,7 +21,7 @@ def has_display() -> bool:
 
 
 class Window:
-    """Appears with the first image and shows at most ``fps`` of them per second, until somebody closes it.
+    """A window that opens with the first image and shows at most ``fps`` images per second, until it is closed.
 
     Raises:
         InputError: there is no display, or this Python has no tkinter.
@@ -47,7 +48,7 @@ class Window:
         self._is_open = True
 
     def show(self, image: NDArray[np.uint8]) -> None:
-        """Show an image (H, W, 3) once the one before has been seen for long enough; nothing in a closed window."""
+        """Show an image (H, W, 3) for at least ``1 / fps`` seconds; do nothing if the window is closed."""
         if not self._is_open:
             return
         time.sleep(max(self._due_s - time.monotonic(), 0.0))

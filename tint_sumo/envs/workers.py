@@ -1,7 +1,6 @@
 """A batch of environments shared out among processes, each with a simulation of its own.
 
-What the environments tell after a step lies in shared memory; the pipes carry the actions, and whatever there is to
-tell of episodes that ended.
+The rows of the environments lie in shared memory; the pipes carry the actions, and the ends of episodes.
 """
 
 import os
@@ -28,7 +27,7 @@ from tint_sumo.envs.rows import Rows, row_type
 from tint_sumo.simulation.connection import libsumo_is_free
 
 _ENDING_S = 10.0  # more than enough for a step, and to close a simulation
-_LOOK_OUT_S = 1e-3  # about the time of a step; sleeping and waking up would cost a large part of it
+_POLL_S = 1e-3  # about the time of a step; sleeping and waking up would cost a large part of it
 _INTEGER = np.dtype(np.int64)
 
 
@@ -38,7 +37,7 @@ def shares_of(num_envs: int, workers: int) -> list[slice]:
 
 
 class WorkerBatch:
-    """``num_envs`` environments shared out among processes, in order and as evenly as can be; each has its settings.
+    """A batch of ``num_envs`` environments in several processes, each of which has its settings.
 
     The first of them is this process, which would have nothing else to do while the others step; unless it already runs
     a simulation of its own, since libsumo holds one per process. An error in one of them, its death, or an interruption
@@ -93,13 +92,13 @@ class WorkerBatch:
         _end(self._helpers)
 
     def _ask(self, request: str, arguments: Callable[[slice], tuple[Any, ...]]) -> list[Any]:
-        """Call a method of every process's batch, with arguments for its share; their answers."""
+        """Call a method of every process's batch, with arguments for its share; return their answers."""
         try:
             for helper in self._helpers:
                 with suppress(ConnectionError):  # a worker that has died is noticed at the next answer
                     helper.line.send((request, *arguments(helper.share)))
-            own = [] if self._local is None else [getattr(self._local, request)(*arguments(self._shares[0]))]
-            return own + self._listen()
+            local = [] if self._local is None else [getattr(self._local, request)(*arguments(self._shares[0]))]
+            return local + self._listen()
         except BaseException:
             self.close()
             raise
@@ -147,7 +146,7 @@ def _end(helpers: list[_Helper]) -> None:
 
 
 class _Shared:
-    """The memory that all processes see.
+    """Memory that all processes share.
 
     It has no name in the file system: nothing is left of it when the last process ends, however it ends.
     """
@@ -161,7 +160,7 @@ class _Shared:
 
     @property
     def sent(self) -> NDArray[np.int64]:
-        """How many messages each worker has been sent, and has sent; (W, 2)."""
+        """Numbers of messages to each worker, and from it; (W, 2)."""
         return np.frombuffer(self._memory, _INTEGER, 2 * self._workers).reshape(-1, 2)
 
     @property
@@ -170,7 +169,7 @@ class _Shared:
 
 
 class _Line:
-    """One end of a pipe, whose receiver looks out for a message for a while before it goes to sleep.
+    """One end of a pipe, whose receiver polls for a message for a while before it sleeps.
 
     Args:
         sent: (2,) in shared memory: how many messages this end has sent, and the other.
@@ -186,7 +185,7 @@ class _Line:
         self._sent[0] += 1
 
     def receive(self) -> Any:
-        end_s = time.perf_counter() + _LOOK_OUT_S
+        end_s = time.perf_counter() + _POLL_S
         while self._sent[1] <= self._received and time.perf_counter() < end_s:
             os.sched_yield()
         self._received += 1
@@ -204,7 +203,7 @@ def _serve(
     settings: TaskSettings,
     autoreset_mode: AutoresetMode,
 ) -> None:
-    """A worker process."""
+    """Run a worker process."""
     line = _Line(pipe, shared.sent[worker, ::-1])
     with suppress(EOFError, ConnectionError):  # the other end is closed
         make_batch = partial(LocalBatch, share.stop - share.start, settings, autoreset_mode, shared.rows[share])

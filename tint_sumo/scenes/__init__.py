@@ -1,4 +1,4 @@
-"""Scenes: roads, routes, the ego's task and who drives. Each scene is one module, imported here once."""
+"""Scenes: roads, routes, the ego's task and the drivers. Each scene is one module, imported here once."""
 
 from tint_sumo.scenes import four_way as four_way
 from tint_sumo.scenes import on_ramp as on_ramp

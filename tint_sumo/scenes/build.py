@@ -14,13 +14,13 @@ DRIVERS_FILE = "drivers.add.xml"
 ROUTES_FILE = "routes.add.xml"
 CONFIG_FILE = "tint.sumocfg"
 DEMO_POISSON_RATE_PER_S = 0.2  # per route; about two thirds of saturation
-_SATURATED_RATE_PER_S = 1.0  # more than a road can take: drivers who find no room are not kept waiting
+_SATURATED_RATE_PER_S = 1.0  # more than a road can take: drivers for whom there is no room do not wait
 _WRITTEN_BY = "<!-- Written by tint-sumo net"
 _MARK = f"{_WRITTEN_BY}; change tint_sumo/scenes and run it again. -->\n"
 
 
 def scene_files(scene: Scene, replicas: int, spacing_m: float = REPLICA_SPACING_M) -> dict[str, str]:
-    """Name and text of every file of a scene; ``spacing_m`` as in ``tint_sumo.scenes.network.plain_xml``.
+    """Return name and text of every file of a scene; ``spacing_m`` as in ``tint_sumo.scenes.network.plain_xml``.
 
     Raises:
         InputError: fewer than one replica.
@@ -63,7 +63,7 @@ def _is_ours(path: Path) -> bool:
 
 
 def _marked(text: str) -> str:
-    """Put the mark first, or behind the XML declaration."""
+    """Return a text with the mark in front, or behind the XML declaration."""
     if text.startswith("<?xml"):
         declaration, rest = text.split("\n", 1)
         return f"{declaration}\n{_MARK}{rest}"

@@ -1,4 +1,4 @@
-"""What tells the roads and the task of one scene from those of another: a hash of listed values.
+"""The digest of a scene's roads and task: a hash of listed values, by which scenes differ.
 
 Policies and trait models carry the digest of the scene that they were trained in, and are refused where it differs.
 So fields are listed by their names: a new one that has a default leaves the digests of all scenes as they are.
@@ -11,7 +11,7 @@ from dataclasses import fields
 from numbers import Real
 from typing import Any, get_args
 
-# Version 1. What is listed here, and in which order, makes the text that is hashed: a change gives all scenes another
+# Version 1. The values listed here, in this order, make the text that is hashed: a change gives all scenes another
 # digest, so that what was trained before is refused. Drivers, their mix and the time limit do not count.
 _LISTED: Mapping[str, tuple[str, ...]] = {
     "Scene": ("network", "routes", "ego", "vehicle", "claim", "step_s", "max_vehicles"),

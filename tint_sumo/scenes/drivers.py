@@ -31,7 +31,7 @@ def require_two_kinds(kinds: int, method: str, drivers: str) -> None:
 
 @dataclass(frozen=True)
 class DriverMember:
-    """One vType."""
+    """A driver as SUMO has it: a vType of its own profile."""
 
     type_id: str
     profile: DriverProfile
@@ -41,7 +41,7 @@ class DriverMember:
 
 
 def members(population: Population) -> tuple[DriverMember, ...]:
-    """All vTypes of a population, profile by profile, as many of each as its weight says."""
+    """Return all vTypes of a population, profile by profile, as many of each as its weight says."""
     gaps, speeds = (np.random.default_rng(seed) for seed in (population.seed, (population.seed, 1)))
     return tuple(
         DriverMember(
@@ -57,7 +57,7 @@ def members(population: Population) -> tuple[DriverMember, ...]:
 
 
 def vtypes_xml(population: Population, p_conservative: float, vehicle: VehicleShape) -> str:
-    """SUMO additional file with every vType, the distribution with P(conservative) and the ego's type."""
+    """Return the SUMO additional file with every vType, the distribution with P(conservative) and the ego's type."""
     drivers = members(population)
     count = Counter(member.profile.yields for member in drivers)
     share = {True: p_conservative, False: 1.0 - p_conservative} if len(count) == 2 else {True: 1.0, False: 1.0}

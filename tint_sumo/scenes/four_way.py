@@ -16,7 +16,7 @@ _TURN_RADIUS_M = 6.0
 
 
 def _network(eastbound_priority: int, *connections: Connection) -> Network:
-    """Roads on which the ego's lane has less priority than the traffic's; westbound traffic goes straight on."""
+    """Return roads on which the ego's lane has less priority than the traffic's; westbound traffic goes straight on."""
     return Network(
         nodes=(
             Node("WI", -_END_M, _EASTBOUND_Y_M, type="dead_end"),

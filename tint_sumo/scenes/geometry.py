@@ -36,7 +36,7 @@ def new_boxes(count: int, length_m: float, width_m: float) -> Boxes:
 
 
 def resample(points: Floats, length_m: float) -> Floats:
-    """Points (P, 2) at every ``SPACING_M`` up to a length, of a polyline (N, 2) that goes straight on at its end."""
+    """Return points (P, 2) at every ``SPACING_M`` of a polyline (N, 2), which goes straight on up to this length."""
     step_m = np.hypot(*np.diff(points, axis=0).T)
     keep = np.r_[True, step_m > 0.0]
     points, step_m = points[keep], step_m[step_m > 0.0]
@@ -48,24 +48,24 @@ def resample(points: Floats, length_m: float) -> Floats:
 
 
 def along(way: Floats) -> Floats:
-    """Arc lengths (P,) of a way's points (P, 2)."""
+    """Return the arc lengths (P,) of a way's points (P, 2)."""
     return np.asarray(np.arange(len(way)) * SPACING_M)
 
 
 def as_line(way: Floats) -> shapely.LineString:
-    """A way as a line of few points, within a millimetre of it."""
+    """Return a way as a line of few points, within a millimetre of it."""
     return shapely.LineString(way).simplify(1e-3)
 
 
 def project(points: Floats, line: shapely.LineString) -> tuple[Floats, Floats]:
-    """How far along a line the points nearest to some points (N, 2) lie, and how far off they are; both (N,)."""
+    """Return the distances of points (N, 2) along a line, where they are nearest to it, and from it; both (N,)."""
     found = shapely.points(points)
     return shapely.line_locate_point(line, found), shapely.distance(line, found)
 
 
 @compiled
 def way_point(way: Floats, along_m: float) -> tuple[float, float]:
-    """The point of a way (P, 2) at an arc length; beyond its ends it goes straight on."""
+    """Return the point of a way (P, 2) at an arc length; beyond its ends it goes straight on."""
     steps = along_m / SPACING_M
     index = min(max(int(steps), 0), way.shape[0] - 2)
     part = steps - index
@@ -179,10 +179,10 @@ def box_distance_m(
     turned_length_m: float,
     turned_width_m: float,
 ) -> float:
-    """Shortest distance between two boxes, one along x and the other turned; 0 where they overlap.
+    """Return the shortest distance between two boxes, one along x and the other turned; 0 where they overlap.
 
     Args:
-        dx_m, dy_m: centre of the box along x, seen from the turned one's.
+        dx_m, dy_m: centre of the box along x, relative to the centre of the turned one.
         cos, sin: heading of the turned box.
         length_m, width_m: of the box along x.
         turned_length_m, turned_width_m: of the turned box.

@@ -1,6 +1,6 @@
-"""What follows from a scene, once: where its routes lead, and where the ego's way meets them.
+"""The routes of a scene in its network, and the zones in which the ego's way meets them; computed once.
 
-A route is known by its number, the traffic's in the scene's order. Vehicles are located by ``front_m``, the distance of
+Routes have numbers, in the order of the scene's traffic. Vehicles are located by ``front_m``, the distance of
 their front bumper from the route's start; SUMO reports positions of the front bumper on its lanes, too.
 """
 
@@ -8,7 +8,7 @@ import tempfile
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import Any
@@ -45,7 +45,7 @@ class Path:
     way: Floats  # (P, 2): see ``tint_sumo.scenes.geometry``
 
     def lane_at(self, front_m: float) -> tuple[int, float]:
-        """Number of the lane at a distance from the route's start, and the position on it."""
+        """Return the number of the lane at a distance from the route's start, and the position on it."""
         starts_m = self.lane_start_m.tolist()
         lane = bisect_right(starts_m, front_m) - 1
         return lane, front_m - starts_m[lane]
@@ -53,7 +53,7 @@ class Path:
 
 @dataclass(frozen=True, eq=False)
 class ConflictZones:
-    """Where the ego's way meets the K routes of the traffic; arc lengths, infinite where it does not.
+    """The zones in which the ego's way meets the K routes of the traffic, as arc lengths; infinite where it does not.
 
     The ego's are those of its front: where it (or its box, see ``tint_sumo.config.Claim``) enters the route's
     lane, where it stands in the vehicles' path, and where its centre has left the lane on the other side (never, where
@@ -81,9 +81,9 @@ class Layout:
     roads: Roads
 
 
-@cache
+@lru_cache(maxsize=16)
 def layout(scene: Scene) -> Layout:
-    """Build the scene's network once, whoever drives there and however long, and look at it.
+    """Return the layout of a scene, whose network is built once for all drivers and time limits.
 
     Raises:
         InputError: a route does not exist or is not connected, or the scene does not fit its network.
@@ -92,7 +92,7 @@ def layout(scene: Scene) -> Layout:
     return replace(_layout(same_roads), scene=scene)
 
 
-@cache
+@lru_cache(maxsize=16)
 def _layout(scene: Scene) -> Layout:
     net = _read(scene)
     routes = tuple(_path(net, route.name, route.edges, scene, ()) for route in scene.routes)
@@ -113,7 +113,7 @@ def _layout(scene: Scene) -> Layout:
 
 
 def _read(scene: Scene) -> Any:
-    """The network of one replica, as sumolib has it."""
+    """Return the network of one replica, as sumolib reads it."""
     with tempfile.TemporaryDirectory(prefix="tint_sumo.") as folder:
         file = FilePath(folder) / "net.xml"
         file.write_text(build_network(plain_xml(scene.network, replicas=1)), encoding="utf-8")
@@ -129,7 +129,7 @@ def _roads(net: Any, scene: Scene, routes: Sequence[Path]) -> Roads:
 
 
 def _path(net: Any, route: str, edges: tuple[str, ...], scene: Scene, way: tuple[Point, ...]) -> Path:
-    """The path along some edges; ``way`` in place of the lanes' shapes if it is given."""
+    """Return the path along some edges; ``way`` in place of the lanes' shapes if it is given."""
     lanes = _lanes(net, route, [name(edge, 0) for edge in edges])
     length_m = np.array([lane.getLength() for lane in lanes])
     shortest_m = scene.network.speed_limit_mps * scene.step_s
@@ -146,7 +146,7 @@ def _path(net: Any, route: str, edges: tuple[str, ...], scene: Scene, way: tuple
 
 
 def _lanes(net: Any, route: str, edges: Sequence[str]) -> list[Any]:
-    """The lanes along some edges, with those on the junctions between them."""
+    """Return the lanes along some edges, with those on the junctions between them."""
     unknown = [edge for edge in edges if not net.hasEdge(edge)]
     if unknown:
         raise InputError(f"route {route!r}: the network has no edge {unknown[0]!r}")
@@ -164,7 +164,7 @@ def _lanes(net: Any, route: str, edges: Sequence[str]) -> list[Any]:
 
 
 def _padded(rows: Sequence[Floats]) -> Floats:
-    """Rows of different lengths as a matrix, infinite where they have ended."""
+    """Return rows of different lengths as a matrix, infinite where they have ended."""
     matrix = np.full((len(rows), max(map(len, rows))), np.inf)
     for row, values in zip(matrix, rows, strict=True):
         row[: len(values)] = values
@@ -173,16 +173,16 @@ def _padded(rows: Sequence[Floats]) -> Floats:
 
 def _shared_lanes(routes: Sequence[Path]) -> Floats:
     starts_m = np.full((len(routes), len(routes), max(len(path.lanes) for path in routes)), np.nan)
-    for own, path in enumerate(routes):
+    for this, path in enumerate(routes):
         start_m = dict(zip(path.lanes, path.lane_start_m.tolist(), strict=True))
         for other, theirs in enumerate(routes):
             for stage, lane in enumerate(theirs.lanes):
-                starts_m[own, other, stage] = start_m.get(lane, np.nan)
+                starts_m[this, other, stage] = start_m.get(lane, np.nan)
     return starts_m
 
 
 def _zones(scene: Scene, routes: Sequence[Path], way: Floats) -> ConflictZones:
-    """Look along the ego's way at each route."""
+    """Return the zones in which the ego's way meets the routes."""
     fronts_m = along(way)
     egos = new_boxes(len(way), scene.vehicle.length_m, scene.vehicle.width_m)
     place(fronts_m, way, egos)
@@ -209,7 +209,7 @@ def _zones(scene: Scene, routes: Sequence[Path], way: Floats) -> ConflictZones:
 
 
 def _first_m(values: Floats, considered: NDArray[np.bool_]) -> float:
-    """Arc length at which values along a way first fall below 0, where they are considered; infinite if never."""
+    """Return the arc length at which considered values along a way first fall below 0; infinite if never."""
     below = considered & (values < 0.0)
     if not below.any():
         return np.inf
@@ -220,7 +220,7 @@ def _first_m(values: Floats, considered: NDArray[np.bool_]) -> float:
 
 
 def _swept_area(scene: Scene, way: Floats) -> BaseGeometry:
-    """All that the ego's box comes so close to that its safety check would hold it, and a little more."""
+    """Return the area that a vehicle must keep out of, and a little more, lest the ego's safety check holds the ego."""
     vehicle = scene.vehicle
     end_m = min(scene.ego.goal_m + vehicle.length_m, (len(way) - 2) * SPACING_M)
     fronts_m: Floats = np.arange(scene.ego.start_m, end_m, _SWEEP_SPACING_M)
@@ -242,7 +242,7 @@ def _polygons(boxes: Boxes) -> NDArray[Any]:
 
 
 def _first_contact_m(path: Path, area: BaseGeometry, width_m: float) -> float:
-    """How far a vehicle's front can come along a path before it touches an area; infinite if it never does."""
+    """Return the arc length at which a vehicle's front first touches an area; infinite if it never does."""
 
     def touches(along_m: Floats) -> NDArray[np.bool_]:
         index = np.clip((along_m / SPACING_M).astype(int), 0, len(path.way) - 2)

@@ -54,7 +54,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class Connection:
-    """From one edge to the next over their junction."""
+    """A way from one edge to the next over their junction."""
 
     start: str  # edge
     end: str
@@ -84,12 +84,12 @@ class PlainXml:
 
 
 def name(part: str, replica: int) -> str:
-    """SUMO id of a network part, for example ``lower_in.0``."""
+    """Return the SUMO id of a network part, for example ``lower_in.0``."""
     return f"{part}.{replica}"
 
 
 def replica_origin(replica: int, spacing_m: float = REPLICA_SPACING_M) -> Point:
-    """Network coordinates (m) of a replica's own origin."""
+    """Return the network coordinates (m) of a replica's origin."""
     return replica % REPLICAS_PER_ROW * spacing_m, replica // REPLICAS_PER_ROW * spacing_m
 
 
@@ -151,7 +151,7 @@ class _Replica:
 
 
 def sumo_program(program: str) -> str:
-    """Path of a program of the ``eclipse-sumo`` package, such as ``netconvert``."""
+    """Return the path of a program of the ``eclipse-sumo`` package, such as ``netconvert``."""
     path = Path(sumo.SUMO_HOME) / "bin" / program
     if not path.exists():
         raise InputError(f"{program} is missing; install it with: pip install eclipse-sumo")

@@ -14,7 +14,7 @@ _MAIN, _RAMP = 3, 1  # priorities
 
 
 def _taper(part: float) -> Point:
-    """The quintic that starts and ends straight and uncurved."""
+    """Return a point of the quintic that starts and ends straight and uncurved."""
     x_m = _TAPER_START_M + (_TAPER_END_M - _TAPER_START_M) * part
     return x_m, _RAMP_Y_M * (1.0 - part**3 * (10.0 - 15.0 * part + 6.0 * part**2))
 

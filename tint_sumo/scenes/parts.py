@@ -1,4 +1,4 @@
-"""What several scenes are made of."""
+"""Parts that several scenes are made of."""
 
 import math
 
@@ -14,19 +14,19 @@ AHEAD_ONLY = EgoController(watches_behind=False)
 
 
 def arc(centre: Point, radius_m: float, start_deg: float, end_deg: float) -> tuple[Point, ...]:
-    """Points of a circle from one angle (0 east, 90 north) to another; clockwise if the second is smaller."""
+    """Return points of a circle from one angle (0 east, 90 north) to another; clockwise if the second is smaller."""
     steps = max(1, round(abs(end_deg - start_deg) / _DEGREES_PER_POINT))
     angles = [math.radians(start_deg + (end_deg - start_deg) * step / steps) for step in range(steps + 1)]
     return tuple((centre[0] + radius_m * math.cos(one), centre[1] + radius_m * math.sin(one)) for one in angles)
 
 
 def quarter_turns(points: tuple[Point, ...], times: int) -> tuple[Point, ...]:
-    """Points turned counterclockwise about the origin."""
+    """Return points turned counterclockwise about the origin."""
     for _ in range(times):
         points = tuple((-y_m, x_m) for x_m, y_m in points)
     return points
 
 
 def mirrored_x(points: tuple[Point, ...]) -> tuple[Point, ...]:
-    """Points mirrored at x = 0."""
+    """Return points mirrored at x = 0."""
     return tuple((-x_m, y_m) for x_m, y_m in points)

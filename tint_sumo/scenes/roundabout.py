@@ -47,7 +47,7 @@ def _end(name: str, point: Point) -> Node:
 
 
 def _network() -> Network:
-    """Junctions stand where the ego's way and the traffic's part or meet; at the west arm nobody meets."""
+    """Return roads with junctions where the ego's way and the traffic's part or meet; no ways meet at the west arm."""
     west_in = (*_LANE_IN, *_ENTRY, *_BETWEEN)
     west_out = (*quarter_turns(_BETWEEN, _NORTH), *_EXIT, *_LANE_OUT)
     east_in, east_out = quarter_turns(_LANE_IN, _EAST), quarter_turns(_LANE_OUT, _EAST)

@@ -1,4 +1,4 @@
-"""A scene as data: a network, the traffic's routes through it, the ego's task, and who drives.
+"""A scene as data: a network, the traffic's routes through it, the ego's task, and the drivers.
 
 A new scene is a file that makes one, and a line in ``tint_sumo/scenes/__init__.py``.
 """
@@ -36,7 +36,7 @@ class Route:
 
 @dataclass(frozen=True)
 class EgoTask:
-    """Where the ego drives; arc lengths are those of its front bumper from its route's start."""
+    """The ego's way from start to goal; arc lengths are those of its front bumper from its route's start."""
 
     edges: tuple[str, ...]
     start_m: float
@@ -132,7 +132,7 @@ class Scene:
 
     @property
     def digest(self) -> str:
-        """What tells the roads, the vehicles and the ego's task from others'; drivers and their mix do not count."""
+        """Digest of the roads, the vehicles and the ego's task; drivers and their mix do not count."""
         return scene_digest(self)
 
 

@@ -1,4 +1,4 @@
-"""Scenes as files tell them: a built-in one with other numbers, or a SUMO configuration and the ego's task in it."""
+"""Scenes in files: a built-in one with other numbers, or a SUMO configuration and the ego's task in it."""
 
 import hashlib
 import json
@@ -41,22 +41,22 @@ RouteM = Annotated[float, Range(0.0, 1e6)]
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """What can be changed in a built-in scene; its roads cannot."""
+    """The numbers that can be changed in a built-in scene; its roads cannot."""
 
     base: str
     """The built-in scene whose roads these are."""
     name: str | None
-    """What the scene is called if it differs from its base; null: the base's name and a number are joined."""
+    """Name of the scene if it differs from its base; null: the base's name and a number are joined."""
     start_m: RouteM
-    """Where the ego's front starts on its way."""
+    """Start of the ego's front on its way."""
     goal_m: RouteM
     """The ego's front past it is a success."""
     controller: EgoController
-    """How the ego drives; its desired speeds are the actions."""
+    """Controller of the ego; its desired speeds are the actions."""
     claim: Claim
-    """When the ego claims a lane, and who reacts to that."""
+    """Conditions of the ego's claim on a lane, and of the drivers' reaction to it."""
     population: PopulationSetting
-    """Who drives: traits, continuous, a list of profiles, or a mapping of what differs from them."""
+    """Drivers: traits, continuous, a list of profiles, or a mapping of what differs from them."""
     arrivals_per_s: ArrivalsPerS | None
     """Rate of drivers who come on each route; null: as many as there is room for."""
     max_vehicles: Slots
@@ -75,7 +75,7 @@ class SceneSettings:
 
     @classmethod
     def of(cls, scene: Scene) -> Self:
-        """The numbers of a scene that is built in, or made from one that is."""
+        """Return the numbers of a scene that is built in, or made from one that is."""
         return cls(
             base=scene.base or scene.name,
             name=scene.name if scene.base else None,
@@ -91,7 +91,7 @@ class SceneSettings:
         )
 
     def scene(self) -> str | Scene:
-        """The scene with these numbers; its name where they are those of the built-in one."""
+        """Return the scene with these numbers; its name where they are those of the built-in one."""
         base = find_scene(self.base)
         if replace(self, name=None) == SceneSettings.of(base):
             return base.name
@@ -119,21 +119,21 @@ class SumocfgSettings:
     ego_route: Many[str]
     """Edges that the ego drives along, one after the other."""
     start_m: RouteM
-    """Where on its route the ego's front is at the beginning; not on a junction."""
+    """Position of the ego's front on its route at the beginning; not on a junction."""
     goal_m: RouteM
     """The ego's front past it is a success."""
     max_vehicles: Slots = SumocfgScene.max_vehicles
     """Most vehicles in an observation, the nearest ones."""
     sight_m: DistanceM = SumocfgScene.sight_m
-    """How far away they may be."""
+    """Farthest distance at which they are observed."""
     warm_up_s: WarmUpS = SumocfgScene.warm_up_s
-    """For how long the traffic runs before the ego appears."""
+    """Time for which the traffic runs before the ego appears."""
     time_limit_s: TimeS = SumocfgScene.time_limit_s
     """Longest time of an episode."""
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     """The ego's shape."""
     controller: EgoController = field(default_factory=EgoController)
-    """How the ego drives; its desired speeds are the actions."""
+    """Controller of the ego; its desired speeds are the actions."""
 
     @classmethod
     def of(cls, scene: SumocfgScene) -> Self:
@@ -149,7 +149,7 @@ def _digest(settings: Mapping[str, Any]) -> str:
 
 
 def read_scene(value: Any, where: Where = ()) -> AnyScene:
-    """What a file means by a scene: a name, what differs from its ``base``, or a ``sumocfg`` and the ego's task.
+    """Return the scene of a file: a name, what differs from a ``base``, or a ``sumocfg`` and the ego's task.
 
     Returns:
         The name of a built-in scene, or another scene.
@@ -172,7 +172,7 @@ def read_scene(value: Any, where: Where = ()) -> AnyScene:
 
 
 def scene_settings(scene: AnyScene) -> SceneSettings | SumocfgSettings:
-    """What a file says of a scene, in full.
+    """Return a scene as a file describes it, in full.
 
     Raises:
         InputError: there is no such scene, or its roads are those of no built-in one.
@@ -186,7 +186,7 @@ def scene_settings(scene: AnyScene) -> SceneSettings | SumocfgSettings:
 
 
 def described(scene: AnyScene) -> dict[str, Any]:
-    """What the settings and the card of a run say of its scene, or of all; ``read_described`` finds it again."""
+    """Return a scene's entries in the settings and the card of a run; ``read_described`` reads them."""
     if isinstance(scene, str):
         return {"scene": scene, "scene_digest": digest_of(scene)}
     changed = scene.sumocfg or scene.base
@@ -195,7 +195,7 @@ def described(scene: AnyScene) -> dict[str, Any]:
 
 
 def read_described(card: Mapping[str, Any]) -> AnyScene:
-    """The scene of a card, or the name of all.
+    """Return the scene of a card, or the name of all.
 
     Raises:
         FieldError: there is no such scene, or a value does not fit.

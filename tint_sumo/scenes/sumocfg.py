@@ -41,7 +41,7 @@ _OUTPUTS = ("netstate-dump", "netstate", "log", "message-log", "error-log")  # a
 
 @dataclass(frozen=True)
 class SumoConfig:
-    """What a .sumocfg says, as far as it has to be known outside of SUMO; paths are absolute."""
+    """The options of a .sumocfg that are needed outside of SUMO; paths are absolute."""
 
     file: Path
     net_file: Path
@@ -55,12 +55,12 @@ class SumoConfig:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All that the simulation follows from."""
+        """All files that the simulation follows from."""
         return (self.file, self.net_file, *self.demand_files)
 
     @property
     def digest(self) -> str:
-        """What tells the configuration's input from others'."""
+        """Digest of the configuration's input."""
         whole = hashlib.sha256()
         for file in self.files:
             with file.open("rb") as content:
@@ -140,7 +140,7 @@ class SumocfgScene:
 
     @property
     def departure(self) -> tuple[tuple[str, ...], float]:
-        """The edges from the one on that the ego starts on, and where on the first of them its front is."""
+        """The edges that are left of the route where the ego starts, and its front's position on the first of them."""
         number = max(index for index, edge_m in enumerate(self.route_edge_start_m) if edge_m <= self.start_m)
         return self.ego_route[number:], self.start_m - self.route_edge_start_m[number]
 
@@ -158,19 +158,19 @@ def from_sumocfg(
     vehicle: VehicleShape | None = None,
     controller: EgoController | None = None,
 ) -> SumocfgScene:
-    """A scene of the configuration's network and demand.
+    """Return a scene of the configuration's network and demand.
 
     Args:
         sumocfg: SUMO configuration; its step length is the scene's.
         ego_route: edges that the ego drives along, one after the other.
-        start_m: where on its route the ego's front is at the beginning; not on a junction.
+        start_m: position of the ego's front on its route at the beginning; not on a junction.
         goal_m: the ego's front past it is a success.
-        max_vehicles: how many vehicles are observed at most, the nearest ones.
-        sight_m: how far away they may be.
-        warm_up_s: for how long the traffic runs before the ego appears.
+        max_vehicles: most vehicles in an observation, the nearest ones.
+        sight_m: farthest distance at which they are observed.
+        warm_up_s: time for which the traffic runs before the ego appears.
         time_limit_s: of an episode.
         vehicle: the ego's shape.
-        controller: how the ego drives, and which desired speeds are its actions.
+        controller: of the ego; its desired speeds are the actions.
 
     Raises:
         InputError: files are missing or of a newer SUMO, the route does not exist or is not connected, or the ego's
@@ -205,7 +205,7 @@ def from_sumocfg(
 
 
 def read_config(file: Path) -> SumoConfig:
-    """Look at a SUMO configuration.
+    """Return what is needed of a SUMO configuration.
 
     Raises:
         InputError: there is none, it is damaged, or files that it names are missing.
@@ -229,7 +229,7 @@ def read_config(file: Path) -> SumoConfig:
 
 
 def _files(config: Path, options: dict[str, str], names: tuple[str, ...]) -> list[Path]:
-    """The files of an option, which stand in relation to the configuration's folder."""
+    """Return the files of an option, whose paths begin at the configuration's folder."""
     value = next((options[name] for name in names if name in options), "")
     files = [config.parent / part.strip() for part in value.split(",") if part.strip()]
     for file in files:
@@ -239,7 +239,7 @@ def _files(config: Path, options: dict[str, str], names: tuple[str, ...]) -> lis
 
 
 def _seconds(text: str, file: Path) -> float:
-    """A time of SUMO's, in seconds or as hours:minutes:seconds."""
+    """Return a step length that SUMO reads, in seconds or as hours:minutes:seconds."""
     try:
         step_s = float(parseTime(text) or math.nan)
     except ValueError:
@@ -250,7 +250,7 @@ def _seconds(text: str, file: Path) -> float:
 
 
 def _elements(file: Path, what: str) -> Iterator[Any]:
-    """All elements of an XML file, forgotten one by one.
+    """Yield all elements of an XML file, each of which is then dropped.
 
     Raises:
         InputError: there is no such file, or it is damaged.
@@ -266,7 +266,7 @@ def _elements(file: Path, what: str) -> Iterator[Any]:
 
 
 def read_vtypes(config: SumoConfig) -> tuple[str, ...]:
-    """Ids of the vTypes of a configuration's vehicles, in place of distributions their members; sorted.
+    """Return the ids of the vTypes of a configuration's vehicles, in place of distributions their members; sorted.
 
     Raises:
         InputError: a file is damaged, or there are too many vTypes.
@@ -284,12 +284,12 @@ def read_vtypes(config: SumoConfig) -> tuple[str, ...]:
                 used.add(element.get("type", DEFAULT_VTYPE))
     found = tuple(sorted(defined | (used - distributions)))
     if len(found) > MOST_LABELS:
-        raise InputError(f"{config.file} has {len(found)} vTypes; at most {MOST_LABELS} can be told apart: use fewer")
+        raise InputError(f"{config.file} has {len(found)} vTypes; at most {MOST_LABELS} fit into labels: use fewer")
     return found
 
 
 def read_net(file: Path, *, with_internal: bool = True) -> Any:
-    """A SUMO network, as sumolib has it.
+    """Return a SUMO network, as sumolib reads it.
 
     Raises:
         InputError: there is no such file, it is no network, or one of a newer SUMO.
@@ -319,7 +319,7 @@ def network_roads(net_file: Path) -> Roads:
 
 
 def _measured(net: Any, edges: tuple[str, ...]) -> tuple[tuple[float, ...], list[tuple[float, float]], float]:
-    """Where a route's edges start on it, from where to where they are, and the route's length."""
+    """Return the starts of a route's edges, their spans, and the route's length, in m along the route."""
     if not edges:
         raise InputError("ego_route is empty; give the edges that the ego drives along")
     unknown = [edge for edge in edges if not net.hasEdge(edge)]
@@ -337,7 +337,7 @@ def _measured(net: Any, edges: tuple[str, ...]) -> tuple[tuple[float, ...], list
 
 
 def _junction_m(net: Any, edge: str, after: str) -> float:
-    """Length of the shortest way over the junction between two edges."""
+    """Return the length of the shortest way over the junction between two edges."""
     ways = [
         way
         for way in net.getEdge(edge).getOutgoing().get(net.getEdge(after), [])

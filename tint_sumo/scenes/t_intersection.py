@@ -45,7 +45,7 @@ class _Turn:
 
     @property
     def start_rad(self) -> float:
-        """Of the front on its arc where the turn starts; 0 is west of the arc's centre, pi/2 north of it."""
+        """Angle of the front on its arc where the turn starts; 0 is west of the arc's centre, pi/2 north of it."""
         return math.asin(_LENGTH_M / 2 / self.radius_m)
 
     @property
@@ -53,7 +53,7 @@ class _Turn:
         return self.start_m + math.pi / 2 * self.radius_m
 
     def crossing_m(self, y_m: float) -> float:
-        """Arc length at which the front reaches ``y_m`` on the first half of its turn."""
+        """Return the arc length at which the front reaches ``y_m`` on the first half of its turn."""
         return self.start_m + self.radius_m * (math.asin(y_m / self.radius_m) - self.start_rad)
 
     def point(self, along_m: float) -> Point:
@@ -67,7 +67,7 @@ class _Turn:
         return tuple(self.point(along_m) for along_m in np.linspace(start_m, end_m, count).tolist())
 
     def goal_m(self) -> float:
-        """Arc length at which the ego's centre reaches the goal; its back is still on the arc then."""
+        """Return the arc length at which the ego's centre reaches the goal; its back is still on the arc then."""
         low_m, high_m = self.end_m, self.end_m + _LENGTH_M
         for _ in range(60):
             middle_m = (low_m + high_m) / 2

@@ -26,7 +26,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.network import sumo_program
 
 _CONNECT_TRIES, _CONNECT_WAIT_S = 600, 0.05  # sumo takes a moment to listen
-_SIMULATION_OPTIONS = ("--net-file", "--configuration-file", "--seed")  # these tell simulations apart
+_SIMULATION_OPTIONS = ("--net-file", "--configuration-file", "--seed")  # in which simulations differ
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def _load(claim: _Claim, options: list[str]) -> None:
 
 
 def _release(claim: _Claim) -> None:
-    """End the simulation of a claim, but none that somebody else has started since."""
+    """End the simulation of a claim, but none that others have started since."""
     with _lock:
         if claim in _claims and claim.process_id == os.getpid():
             if libsumo.isLoaded() and _runs(claim.options):
@@ -169,7 +169,7 @@ def _reach(port: int, process: "subprocess.Popen[bytes]") -> Any:
 
 
 def _end(connection: Any, process: "subprocess.Popen[bytes]", process_id: int) -> None:
-    """End sumo, which has nothing to save, whatever it is doing; only in the process that started it."""
+    """Kill sumo, which has nothing to save; only in the process that started it."""
     if process_id == os.getpid():
         process.kill()
         process.wait()

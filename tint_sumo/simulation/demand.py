@@ -72,7 +72,7 @@ class DriverStream:
         return driver
 
     def placement(self, route_length_m: float) -> Iterator[tuple[Driver, float]]:
-        """Fill the route as an episode starts, from its exit to its entry: drivers and their ``front_m``."""
+        """Yield the drivers on the route as an episode starts, from its exit to its entry, with their ``front_m``."""
         pool, length_m = self._pool, self._pool.scene.vehicle.length_m
         front_m = route_length_m - (length_m + pool.mean_gap_m) * self._rng.random()
         while front_m >= length_m:

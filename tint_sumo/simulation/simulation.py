@@ -1,4 +1,4 @@
-"""What the simulations of all scenes have in common."""
+"""The interface of all simulations, and the parts that they share."""
 
 from abc import ABC, abstractmethod
 

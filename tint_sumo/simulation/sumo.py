@@ -30,7 +30,7 @@ SUMO_COLLISION_CHECK = (
 
 
 class SumoLink:
-    """A running simulation. Vehicles and egos are told apart by their ids, which no two episodes share."""
+    """A running simulation. No two episodes share ids of vehicles and egos."""
 
     def __init__(self, layout: Layout, replicas: int, backend: Backend, collision_options: Sequence[str]) -> None:
         self._layout = layout
@@ -46,7 +46,7 @@ class SumoLink:
         self._episodes[replica] += 1
 
     def add(self, replica: int, slot: int, number: int, route: int, front_m: float, driver: DriverMember) -> None:
-        """Insert a vehicle; it drives at its desired speed, and reacts to no ego until it is told to."""
+        """Insert a vehicle; it drives at its desired speed, and reacts to no ego until ``react``."""
         path = self._layout.routes[route]
         stage, lane_pos_m = path.lane_at(front_m)
         vehicle, vehicle_id = self._vehicle, f"{replica}.{self._episodes[replica]}.{number}"
@@ -96,7 +96,7 @@ class SumoLink:
                 set_speed(ego_id, one_mps)
 
     def step(self) -> Iterator[tuple[int, int]]:
-        """Simulate a step; replica and slot of each vehicle that has left the network."""
+        """Simulate a step; yield replica and slot of each vehicle that has left the network."""
         self._simulate()
         for vehicle_id in self.connection.simulation.getArrivedIDList():
             if vehicle_id in self.index:
@@ -112,7 +112,7 @@ class SumoLink:
 
     @does(StepPart.GETTERS)
     def lane_positions_m(self) -> tuple[Numbers, Floats]:
-        """Indices (N,) of the vehicles' slots, and where their fronts are on their SUMO lanes (N,)."""
+        """Return the numbers (N,) of the vehicles' slots, and the positions (N,) of their fronts on SUMO's lanes."""
         count = len(self.index)
         index = np.fromiter(self.index.values(), np.int64, count)
         return index, np.fromiter(map(self.connection.lane_position_m, self.index), float, count)

@@ -32,12 +32,12 @@ _SEEN = (constants.VAR_POSITION, constants.VAR_ANGLE, constants.VAR_DISTANCE, co
 _SEED_BITS = 31
 _AROUND_M = (30.0, 20.0)  # pictures show so much to each side of the ego
 
-Sight = Mapping[int, Any]  # what SUMO tells of a vehicle, by _SEEN
+Sight = Mapping[int, Any]  # a vehicle's variables of _SEEN
 
 
 @dataclass(frozen=True)
 class VehicleKind:
-    """What the vehicles of a vType have in common."""
+    """The numbers that all vehicles of a vType have."""
 
     member: int  # number of the vType
     length_m: float
@@ -56,7 +56,7 @@ class Kinds:
         self._known: dict[str, VehicleKind] = {}
 
     def of(self, vehicle_id: str) -> VehicleKind:
-        """Raises InputError if the vehicle's vType is in none of the configuration's files."""
+        """Return the kind of a vehicle; InputError if its vType is in none of the configuration's files."""
         vtype = self._connection.vehicle.getTypeID(vehicle_id)
         if vtype not in self._known:
             self._known[vtype] = self._look_up(vehicle_id, vtype)
@@ -79,7 +79,7 @@ class Kinds:
 
 
 def sumo_options(config: SumoConfig, seed: int | Sequence[int], step_s: float | None = None) -> list[str]:
-    """Command-line options that run a configuration with this seed, and let it write none of the files it asks for."""
+    """Return command-line options that run a configuration with this seed, and keep it from writing its files."""
     draws = np.random.SeedSequence(seed).generate_state(1)
     return [
         *("--configuration-file", str(config.file)),
@@ -97,7 +97,7 @@ def sumo_options(config: SumoConfig, seed: int | Sequence[int], step_s: float | 
 
 @contextmanager
 def refusals(config: SumoConfig) -> Iterator[None]:
-    """Tell in one line what SUMO finds fault with."""
+    """Raise InputError, one line, where SUMO finds fault with the configuration."""
     try:
         yield
     except (libsumo.TraCIException, TraCIException, FatalTraCIError) as error:
@@ -192,7 +192,7 @@ class SumocfgSimulation(Simulation):
         self.connection.route.add(EGO, list(scene.departure[0]))
 
     def _let_ego_enter(self) -> None:
-        """The ego enters where it would hinder nobody who could not brake in time; before, it waits."""
+        """Insert the ego once all vehicles near its start could brake in time."""
         vehicle, scene = self.connection.vehicle, self.scene
         _, lane_pos_m = scene.departure
         vehicle.add(EGO, EGO, typeID=EGO, departLane="best", departPos=str(lane_pos_m), departSpeed="0")
@@ -264,7 +264,7 @@ class SumocfgSimulation(Simulation):
         return slot
 
     def _require_ego_on_road(self) -> None:
-        """SUMO puts vehicles that have waited for long elsewhere: whoever stands still would get ahead."""
+        """Raise InputError where SUMO puts the ego elsewhere because it has waited for long: standing would pay off."""
         simulation = self.connection.simulation
         if EGO in simulation.getStartingTeleportIDList():
             raise InputError(
@@ -287,6 +287,6 @@ class SumocfgSimulation(Simulation):
 
 
 def leader_of(connection: Connection, vehicle_id: str, kind: VehicleKind) -> tuple[str, float]:
-    """The vehicle ahead as SUMO sees it, "" if none, and the gap from bumper to bumper; SUMO leaves minGap out."""
-    found = connection.vehicle.getLeader(vehicle_id, NO_LEADER_GAP_M)
+    """Return the id of the vehicle ahead as SUMO has it, and the gap from bumper to bumper; "" and infinite if none."""
+    found = connection.vehicle.getLeader(vehicle_id, NO_LEADER_GAP_M)  # less minGap
     return (found[0], found[1] + kind.min_gap_m) if found else ("", math.inf)

@@ -1,4 +1,4 @@
-"""Which part of an environment step a method does; ``tint-sumo bench`` puts clocks around the marked methods.
+"""Marks for the part of an environment step that a method does; ``tint-sumo bench`` puts clocks around such methods.
 
 A mark costs nothing: the method stays as it is, and moves along with its mark when it is renamed.
 """
@@ -37,7 +37,7 @@ def does(part: StepPart) -> Callable[[Method], Method]:
 
 
 def marked_methods(owner: object) -> Iterator[tuple[str, StepPart]]:
-    """Names of an object's marked methods, and what they do."""
+    """Yield the names of an object's marked methods, and the parts that they do."""
     for name, method in inspect.getmembers(type(owner), inspect.isfunction):
         if hasattr(method, _MARK):
             yield name, getattr(method, _MARK)

@@ -7,10 +7,10 @@ from tint_sumo.cli.command import Command, Outcome
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Command):
-    """Measure how fast the environments and the recorder are on this machine, against SUMO's own speed."""
+    """Measure the speed of environments, recorder and policies on this machine, beside that of SUMO alone."""
 
     quick: bool = False
-    """Measure less, for a first look; 2 to 4 minutes on a free machine otherwise."""
+    """Measure less, for a first look; without it the benchmark takes 2 to 4 minutes on a free machine."""
 
     def run(self) -> Outcome:
         from tint_sumo.bench import QUICK, Sizes, run_benchmark

@@ -6,8 +6,11 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
+from tyro.conf import arg
+
+from tint_sumo.cli.values import optional
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.stores import name_in
 
@@ -16,11 +19,20 @@ if TYPE_CHECKING:
 
 
 RESUMES = ", the same command goes on from here"
+_CONFIG = optional(
+    "FILE",
+    "YAML file with values of these flags, named as here but with underscores; flags that are given here win. A scene, "
+    "a budget or a population can be a mapping there of its base and the numbers that differ.",
+)
+_ADDRESS = arg(
+    help="Address of the Ray cluster: ray://HOST:10001; local for Ray on this machine alone; or auto for the cluster "
+    "that RAY_ADDRESS names or that runs on this machine or, if there is none, local."
+)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command prints: lines for people and, with --json, one object."""
+    """Result of a command: lines for people and, with --json, one object."""
 
     text: str
     content: dict[str, Any]
@@ -28,13 +40,13 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
+    """Base class of commands."""
+
     after_interrupt: ClassVar[str] = ", nothing was kept"
 
     json: bool = False
-    """Print one JSON object as the last line of stdout."""
-    config: Path | None = None
-    """YAML file with values of these flags, named as here but with underscores; flags that are given here win. A scene,
-    a budget or a population can be a mapping there: of its base, and the numbers that differ."""
+    """Print the result as one JSON object, too, in the last line of stdout."""
+    config: Annotated[Path | None, _CONFIG] = None
     print_config: bool = False
     """Print all values as such a file, and do nothing else."""
 
@@ -49,17 +61,15 @@ class Command:
 
 @dataclass(frozen=True, kw_only=True)
 class SpreadCommand(Command):
-    """A command whose work many machines can share."""
+    """Base class of commands whose work many machines can share."""
 
     executor: Literal["local", "ray"] = "local"
-    """local: this machine; ray: a Ray cluster, with the same results (needs tint_sumo[ray])."""
-    address: str = "auto"
-    """Address of the Ray cluster, ray://HOST:10001; local: Ray on this machine alone; auto: the cluster that
-    RAY_ADDRESS names or that runs on this machine or, if there is none, local."""
+    """local: this machine. ray: a Ray cluster, with the same results; needs tint_sumo[ray]."""
+    address: Annotated[str, _ADDRESS] = "auto"
 
     @contextmanager
     def workers_of(self, workers: int, gpus_per_job: float = 0.0) -> "Iterator[Workers]":
-        """In the block, what does the work: so many processes, or the cluster."""
+        """Give, in the block, what does the work: the number of processes, or the cluster."""
         if self.executor == "local":
             for name, value, default in (("address", self.address, "auto"), ("gpus_per_job", gpus_per_job, 0.0)):
                 if value != default:
@@ -86,17 +96,17 @@ def flag_of(name: str) -> str:
 
 
 def names_in(out: str, folder: Path, files: Iterable[Path | None]) -> list[str]:
-    """What the user calls files of a folder that stands for the output folder ``out``."""
+    """Return the names that the user knows of files in a folder that stands for the output folder ``out``."""
     return [name_in(out, file.relative_to(folder)) for file in files if file is not None]
 
 
 def wrote(files: Iterable[str]) -> Iterator[str]:
-    """Lines that tell of the files that were written."""
+    """Return a line for each file that was written."""
     return (f"wrote {file}" for file in files)
 
 
 def use_one_thread() -> None:
-    """The networks are small: more threads gain little, and cost a multiple as soon as other work needs the cores."""
+    """Let torch use one thread: with small networks more gain little, and cost much if other work needs the cores."""
     import torch
 
     torch.set_num_threads(1)

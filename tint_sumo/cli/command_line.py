@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> int:
-    """Run the command that the words of a command line say, and print what comes out."""
+    """Run the command of a command line, and print its outcome."""
     if words[:1] == ["--print-completion"] and words[1:] in ([shell] for shell in get_args(Shell)):
         print(_completion_script(words[1]), end="")
         return 0
@@ -112,7 +112,7 @@ def _refuse(message: str, exit_code: int) -> int:
 
 
 def parse(words: list[str]) -> Command:
-    """The command that the words of a command line say, with what its configuration file says.
+    """Return the command of a command line, with the values of its configuration file.
 
     Raises:
         InputError: the file is not there, a value in it does not fit, a flag comes twice, or a path is a URL.
@@ -126,7 +126,7 @@ def parse(words: list[str]) -> Command:
         default: Any = read_command(kind, file)
         for group in reversed(groups):
             default = group(command=default)
-        with_pairs = [one for one in _TYRO if one is not FlagCreatePairsOff]  # --no-json where the file has json: true
+        with_pairs = [mark for mark in _TYRO if mark is not FlagCreatePairsOff]  # --no-json for json: true
         parsed = tyro.cli(TintSumo, prog="tint-sumo", args=words, default=default, config=with_pairs)
     while not isinstance(parsed, Command):
         parsed = parsed.command
@@ -136,7 +136,7 @@ def parse(words: list[str]) -> Command:
 
 
 def _require_each_once(words: Sequence[str]) -> None:
-    """Raise InputError if a flag comes twice: what stands behind the first would be forgotten in silence."""
+    """Raise InputError if a flag comes twice: the values behind the first would be ignored in silence."""
     flags = [word.partition("=")[0] for word in words if word.startswith("--")]
     for flag in flags:
         if flags.count(flag) > 1:
@@ -154,10 +154,10 @@ def _require_paths(command: Command) -> None:
 
 
 def _completion_script(shell: str) -> str:
-    """A script that a shell reads; it holds all commands and flags, and does not need this package."""
+    """Return a script for a shell that completes commands and flags, and does not need this package."""
     script = io.StringIO()
     with redirect_stdout(script), suppress(SystemExit):
         tyro.cli(TintSumo, prog="tint-sumo", args=["--tyro-print-completion", shell], config=_TYRO)
-    # The script offers each line of a help text as a word of its own.
+    # The script would offer each line of a help text as a word.
     lines = script.getvalue().splitlines(keepends=True)
-    return "".join(one.replace("\\n", " ") if one.startswith("COMPLETION_SPEC") else one for one in lines)
+    return "".join(line.replace("\\n", " ") if line.startswith("COMPLETION_SPEC") else line for line in lines)

@@ -1,4 +1,4 @@
-"""Commands from configuration files, and back. A command is a dataclass; its fields are its flags and its settings."""
+"""Commands from configuration files, and back. A command is a dataclass; its fields are its flags and settings."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -22,14 +22,14 @@ NO_SETTINGS = ("config", "print_config")  # fields that are flags alone
 
 @dataclass(frozen=True)
 class FromFile:
-    """Of a field that is a name among the flags, and can be defined in a file; a value is one or the other."""
+    """Mark of a field whose flag takes a name, and that can be defined in a file."""
 
-    read: Callable[[Any, Where], Any]  # a file's value
-    full: Callable[[Any], Any]  # what a name stands for; what is none stays as it is
+    read: Callable[[Any, Where], Any]  # makes a value of a file's
+    full: Callable[[Any], Any]  # returns the settings that a name stands for, and other values as they are
 
 
 def one_of(module: str, known: str, default: str) -> FromFile:
-    """Of the dictionary ``known`` of a module, which is imported when it is needed; ``default`` is the usual base."""
+    """Return the mark of a field with values in the dictionary ``known`` of a module, which is imported when needed."""
 
     def names() -> Any:
         return getattr(import_module(module), known)
@@ -41,7 +41,7 @@ def one_of(module: str, known: str, default: str) -> FromFile:
 
 
 def name_flag(*names: str) -> PrimitiveConstructorSpec[Any]:
-    """The flag of such a field; any name if no ``names`` are given."""
+    """Return the form of such a field's flag; any name is allowed if no ``names`` are given."""
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar="{" + ",".join(names) + "}" if names else "NAME",
@@ -53,7 +53,7 @@ def name_flag(*names: str) -> PrimitiveConstructorSpec[Any]:
 
 
 def config_of(words: Sequence[str]) -> Path | None:
-    """The configuration file that the words of a command line name."""
+    """Return the configuration file that the words of a command line name."""
     parser = argparse.ArgumentParser(prog="tint-sumo", add_help=False, allow_abbrev=False)
     parser.add_argument(CONFIG_FLAG, type=Path)
     found: Path | None = parser.parse_known_args(words)[0].config
@@ -61,7 +61,7 @@ def config_of(words: Sequence[str]) -> Path | None:
 
 
 def commands_named(root: type, words: Sequence[str]) -> list[type]:
-    """The command that the first words name, behind the groups of commands that it is in."""
+    """Return the command that the first words name, behind the groups of commands that it is in."""
     named = [root]
     for word in words:
         below = subcommands(named[-1])
@@ -72,13 +72,13 @@ def commands_named(root: type, words: Sequence[str]) -> list[type]:
 
 
 def subcommands(kind: type) -> dict[str, type]:
-    """The commands of a group, by their names."""
+    """Return the commands of a group by their names."""
     choices = get_args(get_type_hints(kind, include_extras=True).get("command"))
-    return {mark.name: one.__origin__ for one in choices for mark in one.__metadata__ if hasattr(mark, "name")}
+    return {mark.name: kind.__origin__ for kind in choices for mark in kind.__metadata__ if hasattr(mark, "name")}
 
 
 def read_command(kind: type[T], file: Path) -> T:
-    """A command with the values of a file; what must be given and is not there is left for flags.
+    """Return a command with the values of a file; those that are missing must be given as flags.
 
     Raises:
         InputError: there is no such file, or a value does not fit.
@@ -94,7 +94,7 @@ def _command(kind: type[T], found: YamlFile) -> T:
     hints = get_type_hints(kind, include_extras=True)
     known = {field.name: field for field in fields(kind) if field.name not in NO_SETTINGS}  # type: ignore[arg-type]
     require_fields(found.content, known)
-    given = {name: _value(hints[name], one, (name,)) for name, one in found.content.items()}
+    given = {name: _value(hints[name], value, (name,)) for name, value in found.content.items()}
     missing = {name: tyro.MISSING for name, field in known.items() if name not in given and is_required(field)}
     return kind(**given, **missing)
 
@@ -109,17 +109,17 @@ def _from_file(hint: Any) -> FromFile | None:
 
 
 def _marks(hint: Any) -> tuple[Any, ...]:
-    """What a field's type is annotated with."""
+    """Return the marks beside a field's type."""
     return getattr(hint, "__metadata__", ())
 
 
 def write_command(command: Any) -> str:
-    """A configuration file with all values of a command; ``read_command`` makes the same command of it.
+    """Return a configuration file with all values of a command, from which ``read_command`` makes the same command.
 
     Credentials in URLs are left out.
     """
     hints = get_type_hints(type(command), include_extras=True)
-    values = {one.name: getattr(command, one.name) for one in fields(command) if one.name not in NO_SETTINGS}
+    values = {field.name: getattr(command, field.name) for field in fields(command) if field.name not in NO_SETTINGS}
     for name, value in values.items():
         named = _from_file(hints[name])
         values[name] = value if named is None else named.full(value)

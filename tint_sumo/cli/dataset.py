@@ -4,14 +4,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from tyro.conf import Positional, Suppress, arg, subcommand
+from tyro.conf import Positional, Suppress, subcommand
 
 from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, flag_of, wrote
-from tint_sumo.cli.values import SCENES, FolderOrUrl, MixFlag, PopulationValue, SceneValue
+from tint_sumo.cli.values import FolderOrUrl, MixFlag, PopulationValue, Scene, optional
 from tint_sumo.config import Mix, TrafficSeed, WindowCount
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import PICTURE_SUFFIXES, require_output_file
 from tint_sumo.core.ranges import Processes
+
+_SUMOCFG = optional("FILE", "SUMO configuration in place of a scene: its network and demand, its vTypes as labels.")
+_POPULATION = optional(
+    "{traits,continuous}",
+    "traits: conservative and aggressive drivers. continuous: desired speeds and gaps of all kinds, without classes.",
+    "the scene's, traits in built-in scenes",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,21 +30,18 @@ class Record(SpreadCommand):
     out: FolderOrUrl
     """Folder for the dataset, or a URL such as s3://bucket/folder."""
     windows: WindowCount = 30_000
-    """At least so many windows of up to 20 steps of 0.1 s."""
+    """Least number of windows; a window is up to 20 steps of 0.1 s of a vehicle and its leader."""
     p_conservative: MixFlag = (0.5,)
-    """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
-    population: PopulationValue = None
-    """traits: conservative and aggressive drivers; continuous: desired speeds and gaps without classes; the scene's
-    drivers, traits in all that are built in, if not given."""
+    """Probability that a driver is conservative, 0 to 1; given two numbers, each episode draws it between them."""
+    population: Annotated[PopulationValue, _POPULATION] = None
     seed: TrafficSeed = 0
     """Seed of the traffic."""
-    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}.")] = "t_intersection"
+    scene: Scene = "t_intersection"
     workers: Processes = 1
     """Processes of this machine that simulate; the dataset does not depend on their number."""
     format: Literal["parquet", "fcd"] = "parquet"
-    """Parquet is always written; fcd: SUMO's floating-car data, too, also for a dataset that is there already."""
-    sumocfg: Path | None = None
-    """A SUMO configuration of your own in place of a scene: its network and demand, its vTypes as labels."""
+    """parquet: tables. fcd: also SUMO's floating-car data, which a dataset that is there already can be given."""
+    sumocfg: Annotated[Path | None, _SUMOCFG] = None
 
     def run(self) -> Outcome:
         from tint_sumo.dataset.recorder import record
@@ -79,12 +83,11 @@ class Record(SpreadCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class InspectDataset(Command):
-    """Tell what is in a dataset: counts, settings, and distributions of speed and gap per driver trait."""
+    """Report what is in a dataset: counts, settings, and distributions of speed and gap per driver trait."""
 
     data: Positional[Path]
     """Folder of a dataset."""
-    figure: Path | None = None
-    """Where a picture of the distributions goes: .png, .jpg, .webp, .svg or .pdf."""
+    figure: Annotated[Path | None, optional("FILE", "Picture to write: .png, .jpg, .webp, .svg or .pdf.")] = None
     verify: bool = False
     """Compare all files with the checksums of the manifest first."""
 

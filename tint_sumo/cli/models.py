@@ -1,18 +1,21 @@
 """``tint-sumo models``."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from tyro.conf import Positional
 
 from tint_sumo.cli.command import Command, Outcome
+from tint_sumo.cli.values import optional
+
+_NAME = optional("[NAME]", "Shipped model whose card is shown; a trait model and a policy may share a name.", "all")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Models(Command):
-    """List the trained models that are shipped: kind, method, scene, training and main result; or show one's card."""
+    """List the shipped models with kind, method, scene, training and main result, or show the card of one of them."""
 
-    name: Positional[str | None] = None
-    """Name of a shipped model, whose card is shown; a trait model and a policy may share it."""
+    name: Annotated[Positional[str | None], _NAME] = None
 
     def run(self) -> Outcome:
         from tint_sumo.methods.shipped import card_text, models_named, models_table, shipped_models

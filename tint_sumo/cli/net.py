@@ -4,18 +4,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import arg
-
 from tint_sumo.cli.command import Command, Outcome
-from tint_sumo.cli.values import SCENES, SceneValue
+from tint_sumo.cli.values import Scene
 from tint_sumo.core.ranges import Range
 
 
 @dataclass(frozen=True, kw_only=True)
 class Net(Command):
-    """Build a scene's road network, the drivers and plain SUMO's configuration with netconvert."""
+    """Build a scene's road network with netconvert, its drivers, and a configuration for plain SUMO."""
 
-    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}.")] = "t_intersection"
+    scene: Scene = "t_intersection"
     replicas: Annotated[int, Range(1, 10_000)] = 1
     """Number of intersections in the network."""
     out: Path = Path("sumo_net")

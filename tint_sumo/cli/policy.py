@@ -7,10 +7,25 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import arg, subcommand
 
 from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, use_one_thread, wrote
-from tint_sumo.cli.values import PPO_BUDGET, SCENES, Cases, FolderOrUrl, MixFlag, PpoBudgetValue, SceneValue
-from tint_sumo.config import Decisions, Mix, NoiseM, Seed, TauS
+from tint_sumo.cli.values import (
+    PPO_BUDGET,
+    SCENES,
+    Cases,
+    FolderOrUrl,
+    Gpus,
+    MixFlag,
+    PolicyName,
+    PpoBudgetValue,
+    Scene,
+    SceneValue,
+    TestMix,
+    TestScene,
+    TestTau,
+    optional,
+)
+from tint_sumo.config import Decisions, Mix, NoiseM, Seed
 from tint_sumo.core.percentages import percent
-from tint_sumo.core.ranges import Processes, Range
+from tint_sumo.core.ranges import Processes
 from tint_sumo.core.stores import name_in, working_folder
 from tint_sumo.core.structures import Many, plain
 from tint_sumo.methods.registry import learned_methods
@@ -19,6 +34,22 @@ if TYPE_CHECKING:
     from tint_sumo.methods.loading import Contender
 
 _LEARNED = ", ".join(learned_methods())
+
+_TRAITS = optional(
+    "MODEL",
+    "Trait model of a method that infers traits: name of a shipped one, folder of a training, or path of a "
+    ".safetensors file.",
+    "the method's shipped one",
+)
+_SET = arg(
+    metavar="NAME=VALUE,VALUE [NAME=VALUE,VALUE ...]",
+    help="Values of PPO's settings, all behind one --set, such as learning_rate=0.001,0.003 n_epochs=2,4; names of the "
+    "network's settings begin with policy, such as policy.hidden_size=32,64.",
+)
+_SWEEP_MIX = arg(
+    help="Probability in training that a driver is conservative, 0 to 1; given two numbers, each episode draws it "
+    "between them. Tests are at those of 0.25, 0.4 and 0.6 that this includes."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,21 +62,18 @@ class TrainPolicy(Command):
     out: Path
     """Folder for the policy, its card, the training's curve and the TensorBoard log."""
     p_conservative: MixFlag = (0.1, 0.9)
-    """Probability that a driver is conservative, 0 to 1; two numbers: each episode draws its own between them."""
-    steps: Decisions | None = None
-    """Decisions of the policy; those of the budget if not given."""
+    """Probability that a driver is conservative, 0 to 1; given two numbers, each episode draws it between them."""
+    steps: Annotated[Decisions | None, optional("INT", "Decisions of the policy.", "the budget's")] = None
     seed: Seed = 0
     """Seed of the training, 0 to 1000."""
     budget: PpoBudgetValue = "full"
-    """Sizes of the network, settings of PPO and number of decisions. full takes 5 to 8 minutes on a free core."""
+    """Size of the network, settings of PPO and number of decisions; full takes 5 to 8 minutes on a free core."""
     scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}, or all of them at once: all.")] = "t_intersection"
-    traits: str | None = None
-    """Trait model of methods that infer traits: shipped name, folder of a training run, or .safetensors file; the
-    shipped one of the method if not given."""
+    traits: Annotated[str | None, _TRAITS] = None
     other_scene: bool = False
-    """Take a trait model that was trained in another scene, too."""
+    """Accept a trait model that was trained in another scene."""
     zip: bool = False
-    """Write the policy as Stable-Baselines3's policy.zip, too. That is a pickle: others must trust you to read it."""
+    """Also write Stable-Baselines3's policy.zip, a pickle: whoever reads it must trust you."""
 
     def run(self) -> Outcome:
         from tint_sumo.films.training_films import film_policy
@@ -80,26 +108,20 @@ class TrainPolicy(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluatePolicy(SpreadCommand):
-    """Evaluate a policy on unseen cases, which are the same for every policy; rates are fractions of episodes."""
+    """Evaluate a policy on unseen test episodes (cases), which are the same for every policy."""
 
-    model: str
-    """A shipped policy by its method's name (streaming, oracle, ...), always_go, ttc, the folder of a training run, a
-    .safetensors file, or with --allow-pickle a .zip file."""
-    p_conservative: MixFlag | None = None
-    """Probability that a driver is conservative, 0 to 1, or two numbers between which each case draws its own; those
-    of the policy's training if not given."""
-    scene: SceneValue = None
-    """Scene; the one the policy was trained in if not given, for always_go and ttc t_intersection."""
+    model: PolicyName
+    p_conservative: TestMix = None
+    scene: TestScene = None
     noise: NoiseM = 0.0
     """Standard deviation of the noise on the others' positions, m."""
-    tau: TauS | None = None
-    """Time headway of the other drivers, s; the scene's if not given, 1 s in all that are built in."""
+    tau: TestTau = None
     episodes: Cases = 500
     """Number of cases."""
     seed: Seed = 0
-    """Which set of cases, 0 to 1000."""
+    """Number of the set of cases, 0 to 1000."""
     allow_pickle: bool = False
-    """Read .zip files, which can run any code: only for files you trust."""
+    """Read .zip files, which can run any code: for files that you trust alone."""
 
     def run(self) -> Outcome:
         from tint_sumo.envs.rows import OUTCOMES
@@ -138,31 +160,25 @@ class EvaluatePolicy(SpreadCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class SweepPolicy(SpreadCommand):
-    """Train and test methods with other settings of PPO, all combinations; the same command resumes it. Tests are on
-    cases that are reported nowhere (set 1000), so that settings can be chosen by them."""
+    """Train and test methods with all combinations of some settings of PPO; the same command resumes it."""
 
     after_interrupt: ClassVar[str] = RESUMES
 
-    set: Annotated[Many[str], arg(metavar="NAME=VALUE,VALUE [NAME=VALUE,VALUE ...]")]
-    """Values of PPO's settings, all behind one --set, such as learning_rate=0.001,0.003 n_epochs=2,4; names of the
-    network's settings begin with policy, such as policy.hidden_size=32,64."""
+    set: Annotated[Many[str], _SET]
     out: FolderOrUrl
     """Folder of the sweep, or a URL such as s3://bucket/folder."""
     methods: Annotated[Many[str], arg(help=f"Learned methods: {_LEARNED}.")] = ("oracle",)
     seeds: Many[Seed] = (0,)
     """Seeds of the trainings, 0 to 1000."""
-    p_conservative: MixFlag = (0.1, 0.9)
-    """Probability in training that a driver is conservative, 0 to 1; two numbers: each episode draws its own between
-    them. Tests are at those of 0.25, 0.4 and 0.6 that this includes."""
+    p_conservative: Annotated[MixFlag, _SWEEP_MIX] = (0.1, 0.9)
     budget: PpoBudgetValue = "full"
-    """Sizes of the network, settings of PPO and number of decisions, where --set does not say others."""
-    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}.")] = "t_intersection"
+    """Size of the network, settings of PPO and number of decisions, as far as --set gives no others."""
+    scene: Scene = "t_intersection"
     episodes: Cases = 500
-    """Number of cases of each test."""
+    """Number of cases of each test; no study reports cases of their set (1000), so settings can be chosen by them."""
     workers: Processes = 2
     """Processes of this machine at a time."""
-    gpus_per_job: Annotated[float, Range(0.0, 64.0)] = 0.0
-    """Share of a GPU for each training, with --executor ray and where the cluster has GPUs."""
+    gpus_per_job: Gpus = 0.0
 
     def run(self) -> Outcome:
         from tint_sumo.comparisons.sweep import Sweep, read_varied, report_markdown, run_sweep

@@ -4,63 +4,53 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import Positional, subcommand
 
 from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, names_in, wrote
-from tint_sumo.cli.values import (
-    BUDGET,
-    PLACE,
-    SCENE_STUDY,
-    SCENES,
-    BudgetValue,
-    FolderOrUrl,
-    SceneStudyValue,
-    SceneValue,
-)
+from tint_sumo.cli.values import BUDGET, SCENE_STUDY, BudgetValue, FolderOrUrl, Gpus, Scene, SceneStudyValue, optional
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.ranges import Processes, Range
+from tint_sumo.core.ranges import Processes
 from tint_sumo.core.stores import working_folder
 
 if TYPE_CHECKING:
     from tint_sumo.study.report import StudyReport
 
+_OUT = optional("FOLDER|URL", "Folder of the study, or a URL such as s3://bucket/folder.", "runs/BUDGET")
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunStudy(SpreadCommand):
-    """Record, learn traits, train and evaluate every method, report; the same command resumes an interrupted study."""
+    """Record, learn traits, train and test every method, and report; the same command resumes an interrupted study."""
 
     after_interrupt: ClassVar[str] = RESUMES
 
     budget: BudgetValue = "quick"
-    """quick: minutes, few decisions. full: all methods, four seeds, three hours. paper: all numbers as in the paper,
-    days."""
-    out: Annotated[str | None, PLACE] = None
-    """Folder of the study, or a URL such as s3://bucket/folder; runs/<budget> if not given."""
-    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}.")] = "t_intersection"
+    """quick: few decisions, minutes. full: all methods, four seeds, three hours. paper: the paper's numbers, days."""
+    out: Annotated[str | None, _OUT] = None
+    scene: Scene = "t_intersection"
     workers: Processes = 2
     """Processes of this machine at a time."""
-    gpus_per_job: Annotated[float, Range(0.0, 64.0)] = 0.0
-    """Share of a GPU for each training, with --executor ray and where the cluster has GPUs."""
+    gpus_per_job: Gpus = 0.0
 
     def run(self) -> Outcome:
         from tint_sumo.study.folders import DATASET
         from tint_sumo.study.plan import run_study
 
-        place = self._place()
-        with working_folder(place) as out:
+        out_name = self._out_name()
+        with working_folder(out_name) as out:
             with self.workers_of(self.workers, self.gpus_per_job) as workers:
                 report = run_study(BUDGET.full(self.budget), out, scene=self.scene, workers=workers)
             found = sorted(out.glob("traits/*/latent.png")) + sorted(out.glob("policies/*/policy.safetensors"))
-            made = names_in(place, out, [out / DATASET, *found])
-        outcome = _report_outcome(report, place, out)
+            made = names_in(out_name, out, [out / DATASET, *found])
+        outcome = _report_outcome(report, out_name, out)
         text = "\n".join([outcome.text, *wrote(made)])
         return Outcome(text, {**outcome.content, "made": made})
 
-    def _place(self) -> str:
+    def _out_name(self) -> str:
         if self.out is not None:
             return self.out
         if not isinstance(self.budget, str):
-            raise InputError("a budget of your own needs a folder of its own; say --out FOLDER")
+            raise InputError("a budget without a name needs a folder; give it with --out")
         return f"runs/{self.budget}"
 
 
@@ -82,10 +72,10 @@ class ReportStudy(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class ShowLog(Command):
-    """Print what a job has written to its log, wherever it ran; a job that failed has its error there."""
+    """Print the log of a job, wherever it ran; a job that failed has its error there."""
 
     name: Positional[str]
-    """Name of the job, as "train oracle-P0.4-seed0"."""
+    """Name of the job, such as "train oracle-P0.4-seed0"."""
     out: FolderOrUrl = "runs/quick"
     """Folder of the study, the comparison or the sweep, or its URL."""
 
@@ -98,7 +88,7 @@ class ShowLog(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class StudyScenes(Command):
-    """Test trait models in scenes they were not trained in, half an hour's work; the same command resumes it."""
+    """Test trait models in scenes where they were not trained, in half an hour; the same command resumes it."""
 
     after_interrupt: ClassVar[str] = RESUMES
 
@@ -131,7 +121,7 @@ class Study:
 
 
 def _report_outcome(report: "StudyReport", out: str, folder: Path) -> Outcome:
-    """What a report says, of the study that the user calls ``out`` and that was written in ``folder``."""
+    """Return the outcome for a report that was written in ``folder``, which stands for the user's ``out``."""
     files = names_in(out, folder, (report.csv_file, report.markdown_file, *report.figure_files, report.page_file))
     text = "\n".join([report.markdown, *wrote(files)])
     return Outcome(text, {"results": [row.to_json() for row in report.rows], "files": files})

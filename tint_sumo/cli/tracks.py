@@ -7,7 +7,15 @@ from typing import Annotated
 from tyro.conf import Positional, Suppress, subcommand
 
 from tint_sumo.cli.command import Command, Outcome, wrote
+from tint_sumo.cli.values import optional
 from tint_sumo.core.files import PICTURE_SUFFIXES, require_output_file
+
+_FORMAT = optional(
+    "NAME",
+    "Format: levelx, highd, interaction, ngsim, tgsim, leader_follower, commonroad, fcd, or fcd_geo for floating-car "
+    "data with longitudes and latitudes.",
+    "recognised by the file's beginning",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,11 +24,8 @@ class InspectTracks(Command):
 
     file: Positional[Path]
     """levelX, INTERACTION, NGSIM, TGSIM or leader-follower CSV, CommonRoad XML, or SUMO's floating-car data."""
-    format: str | None = None
-    """levelx, highd, interaction, ngsim, tgsim, leader_follower, commonroad, fcd, or fcd_geo for floating-car data with
-    longitudes and latitudes; recognised by the file's beginning if not given."""
-    figure: Path | None = None
-    """Where a picture goes: .png, .jpg, .webp, .svg or .pdf."""
+    format: Annotated[str | None, _FORMAT] = None
+    figure: Annotated[Path | None, optional("FILE", "Picture to write: .png, .jpg, .webp, .svg or .pdf.")] = None
 
     def run(self) -> Outcome:
         from tint_sumo.tracks import read_tracks

@@ -7,13 +7,27 @@ from typing import Annotated, ClassVar
 from tyro.conf import subcommand
 
 from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, names_in, use_one_thread, wrote
-from tint_sumo.cli.values import TRAIT_BUDGET, TRAIT_STUDY, FolderOrUrl, TraitBudgetValue, TraitStudyValue
+from tint_sumo.cli.values import (
+    TRAIT_BUDGET,
+    TRAIT_STUDY,
+    FolderOrUrl,
+    TestData,
+    TraitBudgetValue,
+    TraitModelName,
+    TraitStudyValue,
+    optional,
+)
 from tint_sumo.config import NoiseM, Seed
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import require_output_file, require_output_folder
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.ranges import Processes, Range
 from tint_sumo.core.stores import working_folder
+
+_NOISE = optional(
+    "FLOAT", "Standard deviation of the noise on every position in training, m.", "the budget's, 0 in named budgets"
+)
+_NET = optional("FILE", "Network of the scenario (.net.xml); without it no leader beyond the end of a lane is seen.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,10 +43,8 @@ class TrainTraits(Command):
     method: str = "vae"
     """vae (the paper's), cross_window and morton learn without labels, classifier with them."""
     budget: TraitBudgetValue = "quick"
-    """quick: for about 30,000 windows; full: for some 700,000; paper: the paper's network and 1000 epochs."""
-    noise: NoiseM | None = None
-    """Standard deviation of the noise on every position in training, m; that of the budget, 0 in all that have names,
-    if not given."""
+    """quick: for about 30,000 windows. full: for about 700,000. paper: the paper's network and 1000 epochs."""
+    noise: Annotated[NoiseM | None, _NOISE] = None
     seed: Seed = 0
     """Seed of the training, and of the split into training and test episodes."""
     streaming: bool = False
@@ -65,16 +77,14 @@ class TrainTraits(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateTraits(Command):
-    """Tell how well a linear classifier reads the drivers' traits from a model's latents, on unseen episodes."""
+    """Measure how well a linear classifier reads the drivers' traits from a model's latents, on unseen episodes."""
 
-    data: Path
-    """Folder of a dataset; the test episodes are those that training with the model's seed leaves out."""
-    model: str
-    """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
+    data: TestData
+    model: TraitModelName
     noise: NoiseM = 0.0
     """Standard deviation of the noise on every position, m."""
     other_scene: bool = False
-    """Take a model that was trained in another scene, too."""
+    """Accept a model that was trained in another scene."""
 
     def run(self) -> Outcome:
         from tint_sumo.traits.datasets import evaluate_traits
@@ -101,16 +111,14 @@ class EvaluateTraits(Command):
 class PlotTraits(Command):
     """Draw a model's latent space beside the trajectories of some windows, and reconstructions if it makes them."""
 
-    data: Path
-    """Folder of a dataset; the test episodes are those that training with the model's seed leaves out."""
-    model: str
-    """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
+    data: TestData
+    model: TraitModelName
     out: Path
     """Folder for the PNG files."""
     noise: NoiseM = 0.0
     """Standard deviation of the noise on every position, m."""
     other_scene: bool = False
-    """Take a model that was trained in another scene, too."""
+    """Accept a model that was trained in another scene."""
 
     def run(self) -> Outcome:
         from tint_sumo.traits.datasets import plot_traits
@@ -127,13 +135,11 @@ class InferTraits(Command):
     """Infer the traits of the vehicles in any SUMO run: a table of latents per vehicle and window of 2 s."""
 
     fcd: Path
-    """What sumo --fcd-output wrote (XML, CSV, Parquet), or a recorded dataset."""
-    model: str
-    """Name of a shipped model, folder of a training run, or path of a .safetensors file."""
+    """Floating-car data of SUMO (sumo --fcd-output: XML, CSV or Parquet), or a recorded dataset."""
+    model: TraitModelName
     out: Path
-    """The table, .csv or .parquet."""
-    net: Path | None = None
-    """The scenario's .net.xml; without it nobody sees a leader beyond the end of a lane."""
+    """Table to write, .csv or .parquet."""
+    net: Annotated[Path | None, _NET] = None
     vehicle_length: Annotated[float, Range(0.5, 30.0)] = 5.0
     """Length of the vehicles in floating-car data, m."""
 
@@ -148,7 +154,7 @@ class InferTraits(Command):
         write_table(table, self.out)
         outside = float(table[OUTSIDE].mean()) if OUTSIDE in table else None
         content = {"out": str(self.out), "windows": len(table), "vehicles": int(table["vehicle"].nunique())}
-        reach = "how many are outside is not known, since the model's card does not tell what it was trained on"
+        reach = "how many are outside is not known, since the model's card does not say what it was trained on"
         if outside is not None:
             reach = f"{percent(outside)}% of the windows lie outside what the model was trained on"
         text = f"{content['windows']} windows of {content['vehicles']} vehicles: {self.out}\n{reach}"
@@ -157,7 +163,7 @@ class InferTraits(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class StudyTraits(SpreadCommand):
-    """Compare all trait methods at every position noise, an hour's work; the same command resumes it."""
+    """Compare all trait methods with more and less noise on positions, in an hour; the same command resumes it."""
 
     after_interrupt: ClassVar[str] = RESUMES
 

@@ -1,14 +1,21 @@
-"""Types of flags. A scene, a population or a budget is a name, or is defined in a configuration file."""
+"""Types of flags with their help. A scene, a population or a budget is a name, or defined in a configuration file."""
 
+from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import arg
 
 from tint_sumo import ENV_IDS
 from tint_sumo.cli.configuration import FromFile, name_flag, one_of
-from tint_sumo.config import Fraction
+from tint_sumo.config import Fraction, TauS
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import Many, Where
+
+
+def optional(metavar: str, text: str, default: str = "none") -> Any:
+    """Return the form of a flag that need not be given: its value, its help, and what holds if it is not given."""
+    return arg(metavar=metavar, help=text, help_behavior_hint=f"(default: {default})")
+
 
 Cases = Annotated[int, Range(1, 1_000_000)]
 MixFlag = Many[Fraction]  # one probability, or the two ends of a range
@@ -50,9 +57,7 @@ TRAIT_BUDGET = one_of("tint_sumo.config", "TRAIT_BUDGETS", "quick")
 TRAIT_STUDY = one_of("tint_sumo.comparisons.traits", "TRAIT_STUDIES", "full")
 SCENE_STUDY = one_of("tint_sumo.comparisons.scenes", "SCENE_STUDIES", "full")
 
-# A path would lose a slash of a URL.
-PLACE = arg(metavar="FOLDER|URL")
-FolderOrUrl = Annotated[str, PLACE]
+FolderOrUrl = Annotated[str, arg(metavar="FOLDER|URL")]  # a path would lose a slash of a URL
 
 # Values are names, or what these make of a file.
 SceneValue = Annotated[Any, name_flag(), SCENE]
@@ -62,3 +67,34 @@ PpoBudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), PPO_BUDGET]
 TraitBudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), TRAIT_BUDGET]
 TraitStudyValue = Annotated[Any, name_flag("full"), TRAIT_STUDY]
 SceneStudyValue = Annotated[Any, name_flag("full"), SCENE_STUDY]
+
+# Flags of several commands.
+Scene = Annotated[SceneValue, arg(help=f"Scene: {SCENES}.")]
+Gpus = Annotated[float, Range(0.0, 64.0), arg(help="Share of a GPU for each training, with --executor ray.")]
+TraitModelName = Annotated[
+    str, arg(help="Trait model: name of a shipped one, folder of a training, or path of a .safetensors file.")
+]
+TestData = Annotated[
+    Path, arg(help="Folder of a dataset; its test episodes are those that training with the model's seed leaves out.")
+]
+PolicyName = Annotated[
+    str,
+    arg(
+        help="Policy: a shipped one by its method (streaming, oracle, ...), a rule (always_go, ttc), the folder of a "
+        "training, the path of a .safetensors file, or with --allow-pickle of a .zip file."
+    ),
+]
+TestMix = Annotated[
+    MixFlag | None,
+    optional(
+        "FLOAT [FLOAT]",
+        "Probability that a driver is conservative, 0 to 1; given two numbers, each case draws it between them.",
+        "as in the policy's training",
+    ),
+]
+TestScene = Annotated[
+    SceneValue, optional("NAME", f"Scene: {SCENES}.", "the policy's; t_intersection for always_go and ttc")
+]
+TestTau = Annotated[
+    TauS | None, optional("FLOAT", "Time headway of the other drivers, s.", "the scene's, 1 s in built-in scenes")
+]

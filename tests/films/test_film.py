@@ -13,7 +13,7 @@ from tint_sumo import ENV_IDS
 from tint_sumo.config import STEP_S
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Progress
-from tint_sumo.films.driving import Moment, drive_case
+from tint_sumo.films.driving import Driven, Moment, drive_case
 from tint_sumo.films.film import Film, render_case
 from tint_sumo.films.frames import SIZE_PX, Artist
 from tint_sumo.films.trait_probe import TraitReader, fit_reader
@@ -29,9 +29,13 @@ BLUE, RED, LAMP, CLAIM = (40, 90, 200), (200, 40, 40), (255, 40, 40), (100, 149,
 
 
 @cache
-def moments(name: str) -> tuple[Moment, ...]:
+def driven(name: str) -> Driven:
     """One case as a policy drives it."""
-    return tuple(drive_case(load_policy(name), CASE, 0, p_conservative=P))
+    return drive_case(load_policy(name), CASE, 0, p_conservative=P)
+
+
+def moments(name: str) -> tuple[Moment, ...]:
+    return driven(name).moments
 
 
 def artist(name: str, reader: TraitReader | None = None) -> Artist:
@@ -49,6 +53,7 @@ def test_a_film_shows_the_case_that_is_judged(name: str) -> None:
     contender = load_policy(name)
     case = evaluate(contender.policy, lambda n: contender.make_venv(n, p_conservative=P), CASE + 1, 0).cases[CASE]
     shown = moments(name)
+    assert driven(name).case == case
     assert (shown[-1].outcome, round(shown[-1].time_s, 3)) == (case.outcome, case.time_s)
     assert [moment.outcome for moment in shown[:-1]] == [""] * (len(shown) - 1)
     np.testing.assert_allclose([moment.time_s for moment in shown], np.arange(len(shown)) * STEP_S)
@@ -106,14 +111,14 @@ def test_fills_are_inferred_traits_and_outlines_true_ones() -> None:
     assert plain.size == SIZE_PX and plain.mode == "RGB"
     outlines = count(plain, BLUE), count(plain, RED)
     assert all(outlines)
-    told = np.where(moment.present[:, None], 1.0, 0.0)
+    inputs = np.where(moment.present[:, None], 1.0, 0.0)
     all_blue = artist("ttc", TraitReader(np.array([99.0]), 0.0, has_spread=False)).frame(
-        replace(moment, observed_traits=told)
+        replace(moment, observed_traits=inputs)
     )
     assert count(all_blue, BLUE) > outlines[0] + 300 * moment.present.sum()
     assert count(all_blue, RED) == pytest.approx(outlines[1], rel=0.05)
     unsure = artist("ttc", TraitReader(np.array([0.0]), 0.0, has_spread=False)).frame(
-        replace(moment, observed_traits=told)
+        replace(moment, observed_traits=inputs)
     )
     assert count(unsure, (190, 190, 190)) > 300 * moment.present.sum()
 

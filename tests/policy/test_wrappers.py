@@ -1,9 +1,12 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs.sb3 import SceneVecEnv
-from tint_sumo.policy import ActionRepeat
+from tint_sumo.policy import ActionRepeat, OracleTraits
+from tint_sumo.policy.wrappers import policy_venv
 
 GO, STOP = 2, 0
 
@@ -45,3 +48,24 @@ def test_at_least_one_step() -> None:
     with pytest.raises(InputError, match="at least 1 step, not 0"):
         ActionRepeat(venv, 0)
     venv.close()
+
+
+def test_every_step_is_shown_until_an_episode_s_very_end() -> None:
+    """What is shown at the end is the end itself, not the beginning of the next episode."""
+    shown: list[tuple[Any, Any]] = []
+    venv = policy_venv(2, OracleTraits(), action_repeat=4, on_step=lambda *step: shown.append(step), time_limit_s=0.6)
+    venv.seed(0)
+    first = venv.reset()
+    venv.step(np.array([2, 0]))
+    *_, done, _ = venv.step(np.array([2, 0]))
+    venv.close()
+    assert done.all()
+    assert isinstance(first, dict) and first.keys() == shown[0][0].keys()
+    np.testing.assert_array_equal(shown[0][0]["ego"], first["ego"])
+    assert [info.get("outcome", "") for _, infos in shown[:7] for info in infos] == [""] * 12 + ["timeout"] * 2
+    observation, infos = shown[6]
+    for env, info in enumerate(infos):
+        for key, value in info["terminal_observation"].items():
+            np.testing.assert_array_equal(observation[key][env], value)
+        np.testing.assert_array_equal(info["traits"], info["terminal_slots"]["traits"])
+    assert (np.diff([step["ego"][0, 1] for step, _ in shown[:7]]) > 0).all()  # it never starts anew

@@ -17,7 +17,7 @@ from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
 from tint_sumo.core.progress import silent
-from tint_sumo.films.driving import Moment, drive_case
+from tint_sumo.films.driving import Driven, Moment, drive_case
 from tint_sumo.films.trait_probe import TraitReader
 from tint_sumo.methods.evaluation import Case, Evaluation
 from tint_sumo.methods.loading import load_policy
@@ -115,14 +115,16 @@ def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -
 
 
 def test_an_episode_survives_its_small_numbers() -> None:
-    moments = [
+    moments = (
         moment([7, -1], -3.14, desired_mps=None, value=None),
         moment([7, 2], 1.5),
         moment([9, 2], 40.0, "collision", claimed=np.array([True, True]), time_s=0.2),
-    ]
+    )
+    driven = Driven(Case("collision", 0.2, "aggressive", "upper"), moments)
     reader = TraitReader(np.array([1.0]), 0.0, has_spread=False)
-    episode = json.loads(json.dumps(encode(moments, reader, ["lower", "upper"])))
+    episode = json.loads(json.dumps(encode(driven, reader, ["lower", "upper"])))
     assert (episode["outcome"], episode["time_s"], episode["frames"]) == ("collision", 0.2, 3)
+    assert episode["hit"] == ["aggressive", "upper"]
     assert [(one["number"], one["trait"], one["first"]) for one in episode["vehicles"]] == [
         (2, 1, 1),
         (7, 0, 0),
@@ -143,8 +145,9 @@ def test_an_episode_survives_its_small_numbers() -> None:
 
 
 def test_rules_have_no_value_no_attention_and_nothing_inferred() -> None:
-    bare = [replace(moment([1, 2], 0.0, "timeout"), value=None, attention=None, observed_traits=None)]
-    episode = encode(bare, None, ["lower", "upper"])
+    bare = replace(moment([1, 2], 0.0, "timeout"), value=None, attention=None, observed_traits=None)
+    episode = encode(Driven(Case("timeout", 50.0), (bare,)), None, ["lower", "upper"])
+    assert episode["hit"] is None
     assert "value" not in episode["ego"]
     assert not {"attention", "p_conservative"} & set(episode["vehicles"][0])
 
@@ -156,9 +159,10 @@ def test_recordings_tell_the_case_and_are_made_once_for_a_policy_and_its_cases(t
     assert job.run(silent) == "policies: 1"
     episodes = read_episodes(recording.file)
     assert list(episodes) == [2, 0]
-    driven = list(drive_case(load_policy("always_go"), 2, 0, p_conservative=0.4))
-    assert (episodes[2]["outcome"], episodes[2]["frames"]) == (driven[-1].outcome, len(driven))
-    assert decoded("x_m", episodes[2]["ego"]["x_m"]) == pytest.approx([one.ego["x_m"] for one in driven], abs=0.006)
+    driven = drive_case(load_policy("always_go"), 2, 0, p_conservative=0.4)
+    assert (episodes[2]["outcome"], episodes[2]["time_s"]) == (driven.case.outcome, driven.case.time_s)
+    x_m = [moment.ego["x_m"] for moment in driven.moments]
+    assert decoded("x_m", episodes[2]["ego"]["x_m"]) == pytest.approx(x_m, abs=0.006)
     written = recording.file.read_bytes()
     assert job.is_done() and job.run(silent) == "policies: 0"
     other = replace(recording, cases=(0,))
@@ -325,11 +329,11 @@ def test_what_came_out_is_told_of_the_mixes_that_all_methods_met(results: dict[s
 
 
 def test_failures_are_listed_folded_and_only_where_there_are_any() -> None:
-    def recorded(method: str, fared: Evaluation, outcome: str) -> Recorded:
-        return Recorded(Shown(method, "ttc", None, 0, fared), {0: {"outcome": outcome, "time_s": 10.0}})
+    def recorded(method: str, fared: Evaluation, outcome: str, hit: Any = None) -> Recorded:
+        return Recorded(Shown(method, "ttc", None, 0, fared), {0: {"outcome": outcome, "time_s": 10.0, "hit": hit}})
 
     good = recorded("good", outcomes("ss"), "success")
-    bad = recorded("bad", outcomes("cs"), "collision")
+    bad = recorded("bad", outcomes("cs"), "collision", ["aggressive", "upper"])
     unlucky = recorded("unlucky", outcomes("sc"), "success")  # its failure is none of the recorded cases
     choice = Choice(Conditions(Mix(0.4)), (), (0,))
     lists = failure_lists(Recordings("t_intersection", choice, (good, bad, unlucky), ()))
@@ -337,6 +341,7 @@ def test_failures_are_listed_folded_and_only_where_there_are_any() -> None:
     assert re.findall("<details><summary>(.*?)</summary>", lists) == [
         "bad: 1 collision and 0 timeouts in 2 cases; 1 of them recorded"
     ]
+    assert "Case 0: collision after 10.0 s (aggressive, upper)</button>" in lists
     assert "<p>unlucky: 1 collision and 0 timeouts in 2 cases; 0 of them recorded</p>" in lists
     assert failure_lists(Recordings("t_intersection", choice, (good,), ())) == ""
 

@@ -240,10 +240,8 @@ def test_failures_open_in_the_player(browser: Any, study: Path, how: str) -> Non
     opened.context.close()
 
 
-def test_the_list_tells_how_often_all_failed_and_what_was_recorded_otherwise(opened: Opened) -> None:
-    failures = opened.text("#failures")
-    assert "2 collisions and 0 timeouts in 3 cases" in failures
-    assert "of the recorded episodes ended otherwise" in opened.text("#player")
+def test_the_list_says_how_often_each_policy_failed(opened: Opened) -> None:
+    assert "2 collisions and 0 timeouts in 3 cases" in opened.text("#failures")
 
 
 def test_the_keyboard_alone_reaches_every_control_and_shows_where_it_is(opened: Opened) -> None:

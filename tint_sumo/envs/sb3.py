@@ -24,7 +24,8 @@ class SceneVecEnv(VecEnv):
     Takes the arguments of ``tint_sumo.envs.scene_env.SceneEnv``, and ``workers`` as ``SceneVectorEnv`` does.
     ``infos[i]`` holds ``traits``, the true traits that go with the returned observation; when an episode ends also
     ``terminal_observation``, ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``is_success``, ``time_s`` and,
-    after a collision, ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then.
+    after a collision, ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then; without
+    ``autoreset`` it has not, and the environment shows the end of its episode until it is parked or all are reset.
     ``slots`` holds arrays (N, V) of what else is known of the vehicles in the returned observations, and
     ``terminal_slots`` the same of the terminal one: ``traits``, and with ``tracks`` also ``position_m``, ``gap_m`` and
     ``passed``.
@@ -39,10 +40,12 @@ class SceneVecEnv(VecEnv):
         scene: AnyScene | Sequence[AnyScene] = T_INTERSECTION,
         render_mode: str | None = None,
         workers: int | None = None,
+        autoreset: bool = True,
         **task: Any,
     ) -> None:
         require_arguments(SceneVecEnv, task)
-        self.env = SceneVectorEnv(num_envs, scene, render_mode, workers, AutoresetMode.SAME_STEP, **task)
+        mode = AutoresetMode.SAME_STEP if autoreset else AutoresetMode.DISABLED
+        self.env = SceneVectorEnv(num_envs, scene, render_mode, workers, mode, **task)
         super().__init__(num_envs, self.env.single_observation_space, self.env.single_action_space)
         self._actions: NDArray[np.int64] = np.zeros(num_envs, np.int64)
         if seed is not None:

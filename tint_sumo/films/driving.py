@@ -1,18 +1,19 @@
 """Drive one case step by step, and keep all that a film shows."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
 
-from tint_sumo.envs import SceneEnv
-from tint_sumo.methods.evaluation import case_seed
+from tint_sumo.envs.batch import LocalBatch
+from tint_sumo.envs.sb3 import SceneVecEnv
+from tint_sumo.methods.evaluation import Case, evaluate
 from tint_sumo.methods.loading import Contender
 from tint_sumo.policy.network import GruPolicy
-from tint_sumo.policy.trait_sources import Frame, OracleTraits, TraitSource, one_hot
+from tint_sumo.policy.trait_sources import Observation, OracleTraits, one_hot
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
 from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers
 from tint_sumo.simulation.scene import SceneSimulation
@@ -34,7 +35,7 @@ class Moment:
     boxes: Boxes  # (V,)
     brakes: Bools  # (V,)
     traits: Numbers  # (V,) true ones: numbers of profiles, -1 in empty slots
-    observed_traits: Floats | None  # (V, Z) traits in the policy's observation
+    observed_traits: Floats | None  # (V, Z) traits in the policy's observation; None where it has none
     attention: Floats | None  # (V,)
     claimed: Bools  # (K,)
     desired_mps: float | None  # the policy's action; None before its first
@@ -42,78 +43,114 @@ class Moment:
     outcome: str  # empty until the end
 
 
-class _Driver:
-    """A policy with its recurrent state."""
+@dataclass(frozen=True)
+class Driven:
+    """A case and its moments, the beginning first."""
+
+    case: Case
+    moments: tuple[Moment, ...]
+
+
+def drive_case(contender: Contender, case: int, seed: int, **task: Any) -> Driven:
+    """Evaluate a policy on case ``case`` of the set ``seed``, and keep every step of the simulation.
+
+    Args:
+        contender: the policy.
+        case: number of the case, as in ``tint_sumo.methods.evaluation.evaluate``.
+        seed: which set of cases.
+        task: as in ``SceneEnv``.
+    """
+    recorder = _Recorder(contender)
+
+    def make_venv(num_envs: int) -> VecEnv:
+        venv = contender.make_venv(num_envs, on_step=recorder.record, **task)
+        recorder.attach(venv)
+        return venv
+
+    evaluation = evaluate(recorder, make_venv, 1, seed, first=case)
+    return Driven(evaluation.cases[0], tuple(recorder.moments))
+
+
+class _Recorder:
+    """A contender's policy that keeps the moments of the first episode of its one environment."""
 
     def __init__(self, contender: Contender) -> None:
         self._policy = contender.policy
         inner: Any = getattr(contender.policy, "policy", contender.policy)  # a Stable-Baselines3 model holds its policy
         self._network = inner if isinstance(inner, GruPolicy) else None
-        self._state: Any = None
-        self._starts = np.ones(1, bool)
+        self._desired_mps: float | None = None
+        self._value: float | None = None
+        self.moments: list[Moment] = []
 
-    def act(self, observation: dict[str, NDArray[Any]], traits: Numbers) -> tuple[int, float | None]:
-        """Return the likeliest action, and the expected return."""
-        value = None if self._network is None else self._value(self._network, observation, traits)
-        actions, self._state = self._policy.predict(
-            observation, state=self._state, episode_start=self._starts, deterministic=True
+    def attach(self, venv: VecEnv) -> None:
+        """Look at the simulation of these environments from now on."""
+        base = venv.unwrapped
+        assert isinstance(base, SceneVecEnv) and isinstance(base.env.batch, LocalBatch)
+        simulation = base.env.batch.episodes.simulation
+        assert isinstance(simulation, SceneSimulation)  # films show built-in scenes
+        self._simulation = simulation
+        self._speeds = _Speeds(simulation)
+
+    def predict(
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], Any]:
+        """Return the policy's actions and state, as ``Policy.predict`` does."""
+        if self._network is not None and episode_start is not None:
+            self._value = self._predict_value(self._network, observation, state, episode_start)
+        actions, state = self._policy.predict(
+            observation, state=state, episode_start=episode_start, deterministic=deterministic
         )
-        self._starts = np.zeros(1, bool)
-        return int(actions[0]), value
+        self._desired_mps = self._simulation.scene.ego.controller.desired_speeds_mps[int(actions[0])]
+        return actions, state
 
     @torch.no_grad()
-    def _value(self, network: GruPolicy, observation: dict[str, NDArray[Any]], traits: Numbers) -> float:
+    def _predict_value(
+        self, network: GruPolicy, observation: Observation, state: Any, starts: NDArray[np.bool_]
+    ) -> float:
         seen = dict(observation)
         if network.critic_extractor is not None:
-            seen[TRUE_TRAITS] = one_hot(traits[None], OracleTraits().size)
+            seen[TRUE_TRAITS] = one_hot(self.moments[-1].traits[None], OracleTraits().size)
         tensors, _ = network.obs_to_tensor(seen)
         device = network.device
-        states = network.initial_states(1) if self._state is None else torch.as_tensor(self._state[0], device=device)
-        return float(network.predict_values(tensors, states, torch.as_tensor(self._starts, device=device)))
+        states = network.initial_states(1) if state is None else torch.as_tensor(state[0], device=device)
+        return float(network.predict_values(tensors, states, torch.as_tensor(starts, device=device)))
 
-    def attention(self, observation: dict[str, NDArray[Any]]) -> Floats | None:
-        """Return the weights of the vehicles (V,); None without a network."""
-        return None if self._network is None else self._network.attention_weights(observation)[0].astype(np.float64)
-
-
-class _Stage:
-    """The environment of one case, with the source of the traits in its observation."""
-
-    def __init__(self, contender: Contender, task: dict[str, Any]) -> None:
-        source: TraitSource | None = None if contender.source is None else contender.source()
-        tracks = source is not None and source.needs_tracks
-        self.env = SceneEnv(contender.scene, tracks=tracks, **task)
-        self.source = source
-        assert isinstance(self.env.simulation, SceneSimulation)  # policies drive in built-in scenes
-        self.simulation: SceneSimulation = self.env.simulation
-        if source is not None:
-            source.attach(1, self.simulation.scene.max_vehicles)
-
-    def begin(self, seed: int) -> None:
-        self._take(*self.env.reset(seed=seed), done=True)
-        if self.source is not None:
-            self.source.begin(self.frame)
-
-    def step(self, action: int) -> None:
-        observation, _, terminated, truncated, info = self.env.step(np.int64(action))
-        self._take(observation, info, done=terminated or truncated)
-        if self.source is not None:
-            self.source.advance(self.frame)
-
-    def _take(self, observation: dict[str, NDArray[Any]], info: dict[str, Any], *, done: bool) -> None:
-        slots = {key: value[None] for key, value in info.items() if isinstance(value, np.ndarray)}
-        self.frame = Frame({key: value[None] for key, value in observation.items()}, slots, np.array([done]))
-        self.info = info
-
-    @property
-    def observation(self) -> dict[str, NDArray[Any]]:
-        """The observation as a batch of one, with the traits."""
-        traits = {} if self.source is None else {TRAITS: self.source.traits.copy()}
-        return {**self.frame.observation, **traits}
+    def record(self, observation: Observation, infos: list[dict[str, Any]]) -> None:
+        """Keep the moment after a step, until the episode has ended."""
+        if self.moments and self.moments[-1].outcome:
+            return
+        simulation, (info,) = self._simulation, infos
+        egos, slots = simulation.egos, simulation.slots
+        brakes, ego_brakes = self._speeds.brakes()
+        attention = None if self._network is None else self._network.attention_weights(observation)[0]
+        self.moments.append(
+            Moment(
+                time_s=len(self.moments) * simulation.scene.step_s,
+                ego=egos.box[0].copy(),
+                ego_mps=float(egos.speed_mps[0]),
+                ego_brakes=ego_brakes,
+                is_held=bool(egos.unsafe[0]),
+                present=slots.present[0].copy(),
+                vehicles=slots.vehicle_number[0].copy(),
+                boxes=slots.box[0].copy(),
+                brakes=brakes,
+                traits=info["traits"].astype(np.int64),
+                observed_traits=observation[TRAITS][0].astype(np.float64) if TRAITS in observation else None,
+                attention=None if attention is None else attention.astype(np.float64),
+                claimed=simulation.yielding.has_claimed[0].copy(),
+                desired_mps=self._desired_mps,
+                value=self._value,
+                outcome=info.get("outcome", ""),  # the info of a reset has none
+            )
+        )
 
 
 class _Speeds:
-    """Speeds between two steps, which show who brakes."""
+    """Finds the vehicles that brake, from their positions at each step."""
 
     def __init__(self, simulation: SceneSimulation) -> None:
         self._simulation = simulation
@@ -124,7 +161,7 @@ class _Speeds:
         self._ego_mps = 0.0
 
     def brakes(self) -> tuple[Bools, bool]:
-        """Return whether the vehicles (V,) and the ego have braked in the last step."""
+        """Return whether the vehicles (V,) braked in the step just made, and whether the ego did."""
         slots = self._simulation.slots
         stays = slots.present[0] & (slots.vehicle_number[0] == self._who)
         mps = np.where(stays, (slots.front_m[0] - self._front_m) / self._step_s, np.nan)
@@ -134,49 +171,3 @@ class _Speeds:
         self._who, self._front_m = slots.vehicle_number[0].copy(), slots.front_m[0].copy()
         self._mps, self._ego_mps = mps, ego_mps
         return brakes, ego_brakes
-
-
-def drive_case(contender: Contender, case: int, seed: int, **task: Any) -> Iterator[Moment]:
-    """Yield the beginning and every step of case ``case`` of the set ``seed``; ``task`` as in ``SceneEnv``.
-
-    The case goes as it does in ``tint_sumo.methods.evaluation.evaluate``: the policy decides every
-    ``action_repeat`` steps.
-    """
-    stage, driver = _Stage(contender, task), _Driver(contender)
-    speeds = _Speeds(stage.simulation)
-    desired_mps = stage.simulation.scene.ego.controller.desired_speeds_mps
-    try:
-        stage.begin(case_seed(seed, case))
-        yield _moment(stage, driver, speeds, None, None)
-        step = 0
-        while not stage.info["outcome"]:
-            if step % contender.action_repeat == 0:
-                action, value = driver.act(stage.observation, stage.info["traits"])
-            stage.step(action)
-            step += 1
-            yield _moment(stage, driver, speeds, desired_mps[action], value)
-    finally:
-        stage.env.close()
-
-
-def _moment(stage: _Stage, driver: _Driver, speeds: _Speeds, desired_mps: float | None, value: float | None) -> Moment:
-    egos, slots, observation = stage.simulation.egos, stage.simulation.slots, stage.observation
-    brakes, ego_brakes = speeds.brakes()
-    return Moment(
-        time_s=stage.info["time_s"],
-        ego=egos.box[0].copy(),
-        ego_mps=float(egos.speed_mps[0]),
-        ego_brakes=ego_brakes,
-        is_held=bool(egos.unsafe[0]),
-        present=slots.present[0].copy(),
-        vehicles=slots.vehicle_number[0].copy(),
-        boxes=slots.box[0].copy(),
-        brakes=brakes,
-        traits=stage.info["traits"].astype(np.int64),
-        observed_traits=observation[TRAITS][0].astype(np.float64) if TRAITS in observation else None,
-        attention=driver.attention(observation),
-        claimed=stage.simulation.yielding.has_claimed[0].copy(),
-        desired_mps=desired_mps,
-        value=value,
-        outcome=stage.info["outcome"],
-    )

@@ -68,15 +68,15 @@ def render_case(
         raise InputError(f"case must lie in 0 to {CASES_PER_SEED - 1}, not {case}")
     mix = contender.p_conservative if p_conservative is None else Mix.parse(p_conservative)
     played = require_film_scene(contender)
-    moments = list(drive_case(contender, case, seed, p_conservative=mix, **task))
-    shown = _spread(moments) if out.suffix.lower() == ".png" else moments
+    driven = drive_case(contender, case, seed, p_conservative=mix, **task)
+    shown = _spread(driven.moments) if out.suffix.lower() == ".png" else driven.moments
     parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(mix))
-    has_attention = moments[0].attention is not None
+    has_attention = driven.moments[0].attention is not None
     colour = ImageColor.getrgb(look_of(contender.method).colour)
     artist = Artist(layout(played), (" " * 5).join(parts), colour, fit_reader(contender), has_attention)
     with whole_file(out) as partial:
         _WRITERS[out.suffix.lower()](partial, artist, shown, report)
-    return Film(moments[-1].outcome, round(moments[-1].time_s, 3), len(shown))
+    return Film(driven.case.outcome, driven.case.time_s, len(shown))
 
 
 def require_film_scene(contender: Contender) -> Scene:

@@ -19,7 +19,7 @@ from tint_sumo.methods.rules import ACTIONS as RULE_ACTIONS
 from tint_sumo.methods.training import POLICY, TRAITS, digest
 from tint_sumo.policy import RecurrentPPO, TraitSource
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
-from tint_sumo.policy.wrappers import policy_venv
+from tint_sumo.policy.wrappers import OnStep, policy_venv
 from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, find_scene, read_described
 from tint_sumo.traits import TraitModel
 
@@ -45,15 +45,16 @@ class Contender:
         """Time headway of the scene's drivers; None in a SUMO configuration."""
         return find_scene(self.scene).tau_s
 
-    def make_venv(self, num_envs: int, **task: Any) -> VecEnv:
-        """Environments with the observations the policy takes; ``task`` as in ``SceneEnv``.
+    def make_venv(self, num_envs: int, *, on_step: OnStep | None = None, **task: Any) -> VecEnv:
+        """Return environments with the observations that the policy takes; ``task`` as in ``SceneEnv``.
 
         In a SUMO configuration each has a process of its own, and there are no more than the machine has cores.
+        ``on_step`` is as in ``tint_sumo.policy.wrappers.policy_venv``.
         """
         source = None if self.source is None else self.source()
         place = task.get("scene", self.scene)
         count = min(num_envs, os.cpu_count() or 1) if find_scene(place).sumocfg else num_envs
-        return policy_venv(count, source, action_repeat=self.action_repeat, **{"scene": place, **task})
+        return policy_venv(count, source, action_repeat=self.action_repeat, on_step=on_step, **{"scene": place, **task})
 
 
 def load_policy(name_or_path: str | Path, *, scene: AnyScene | None = None, allow_pickle: bool = False) -> Contender:

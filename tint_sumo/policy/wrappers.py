@@ -1,7 +1,7 @@
 """The environments a policy is trained and tested in: a scene, traits in its observations, decisions now and then."""
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,8 @@ from tint_sumo.scenes import T_INTERSECTION, find_scene
 
 TRAITS, TRUE_TRAITS = "traits", "true_traits"
 _NEEDED = frozenset({"ego", "vehicles", "mask"})
+
+OnStep = Callable[[Observation, list[dict[str, Any]]], None]  # takes observations, arrays (N, ...), and N infos
 
 
 class TraitObservation(VecEnvWrapper):
@@ -107,19 +109,29 @@ class ActionRepeat(VecEnvWrapper):
     by step, so that traits are inferred at each of them; an environment with ``decision_s`` shows only what is there
     after the decision. And with ``decision_s`` the next episode begins when the decision is over, and does not wait.
 
+    Args:
+        venv: the environments.
+        repeat: number of steps.
+        on_step: called after each reset of all environments and after each of the steps. Where an episode ends, the
+            observation is its last one.
+
     Raises:
         InputError: ``repeat`` is less than 1.
     """
 
-    def __init__(self, venv: VecEnv, repeat: int) -> None:
+    def __init__(self, venv: VecEnv, repeat: int, on_step: OnStep | None = None) -> None:
         if repeat < 1:
             raise InputError(f"an action is taken for at least 1 step, not {repeat}")
         super().__init__(venv)
         self.repeat = repeat
+        self._on_step = on_step
         self._actions = np.zeros(venv.num_envs, np.int64)
 
     def reset(self) -> VecEnvObs:
-        return self.venv.reset()
+        observation = self.venv.reset()
+        if self._on_step is not None:
+            self._on_step(_dictionary(observation), self.venv.reset_infos)
+        return observation
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = np.asarray(actions)
@@ -134,6 +146,9 @@ class ActionRepeat(VecEnvWrapper):
             for index in np.flatnonzero(~ended):
                 last[index] = infos[index]
             ended |= done
+            if self._on_step is not None:
+                terminal = {env: infos[env]["terminal_observation"] for env in np.flatnonzero(done).tolist()}
+                self._on_step(_continued(_dictionary(observation), terminal), infos)
         return observation, total, ended, last
 
 
@@ -144,6 +159,7 @@ def policy_venv(
     action_repeat: int = 1,
     critic_sees_true_traits: bool = False,
     monitored: bool = False,
+    on_step: OnStep | None = None,
     **task: Any,
 ) -> VecEnv:
     """Return ``num_envs`` environments of a scene with the wrappers that a policy needs.
@@ -154,17 +170,20 @@ def policy_venv(
         action_repeat: simulation steps per decision.
         critic_sees_true_traits: observe the true traits, too, under another key.
         monitored: count steps and rewards of each episode for Stable-Baselines3's logger.
+        on_step: called with every step of the simulation, as in ``ActionRepeat``; the environments then show the end of
+            an episode until they are parked or reset.
         task: as in ``tint_sumo.envs.scene_env.SceneEnv``.
     """
     scene = task.get("scene", T_INTERSECTION)
     if not isinstance(scene, list) and find_scene(scene).sumocfg:  # one simulation per process
         task["scene"] = [scene] * num_envs
-    venv: VecEnv = SceneVecEnv(num_envs, tracks=source is not None and source.needs_tracks, **task)
+    tracks = source is not None and source.needs_tracks
+    venv: VecEnv = SceneVecEnv(num_envs, tracks=tracks, autoreset=on_step is None, **task)
     if source is not None:
         venv = TraitObservation(venv, source)
     if critic_sees_true_traits:
         venv = TraitObservation(venv, OracleTraits(), TRUE_TRAITS)
-    return ActionRepeat(VecMonitor(venv) if monitored else venv, action_repeat)
+    return ActionRepeat(VecMonitor(venv) if monitored else venv, action_repeat, on_step)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from typing import Any
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.jobs import Workers
-from tint_sumo.methods.evaluation import Case
 from tint_sumo.methods.registry import METHODS, look_of
 from tint_sumo.scenes import Scene
 from tint_sumo.study.page.choosing import FAILURES, Choice, Shown
@@ -98,13 +97,6 @@ def player_notes(recordings: Recordings) -> str:
             "few successes. The policies take their likeliest actions, as they did in the tests."
         )
     ]
-    if differing := _differing(recordings):
-        parts.append(
-            paragraph(
-                f"{differing} of the recorded episodes ended otherwise than in the study's tests: another version of "
-                "a package or another machine was at work then. The player shows what was recorded now."
-            )
-        )
     return "".join([*parts, *(paragraph(f"Left out: {refusal}") for refusal in recordings.refusals)])
 
 
@@ -122,28 +114,16 @@ def _failures(one: Recorded) -> str:
     told = " and ".join(_count(number, outcome) for outcome, number in counts.items())
     buttons = [
         f'<button type="button" data-policy="{escape(one.policy.label)}" data-case="{case}">'
-        f"{escape(_told(case, episode, cases[case]))}</button>"
+        f"{escape(_failure(case, episode))}</button>"
         for case, episode in failed.items()
     ]
     summary = f"{one.policy.title}: {told} in {len(cases)} cases; {len(failed)} of them recorded"
     return folded(summary, bullets(buttons)) if buttons else paragraph(summary)
 
 
-def _told(number: int, episode: dict[str, Any], case: Case) -> str:
-    text = f"Case {number}: {episode['outcome']} after {episode['time_s']:.1f} s"
-    return text + (f" ({case.trait}, {case.route})" if _agree(episode, case) and case.trait else "")
-
-
-def _agree(episode: dict[str, Any], case: Case) -> bool:
-    return (episode["outcome"], episode["time_s"]) == (case.outcome, case.time_s)
-
-
-def _differing(recordings: Recordings) -> int:
-    return sum(
-        not _agree(episode, one.policy.evaluation.cases[number])
-        for one in recordings.policies
-        for number, episode in one.episodes.items()
-    )
+def _failure(case: int, episode: dict[str, Any]) -> str:
+    text = f"Case {case}: {episode['outcome']} after {episode['time_s']:.1f} s"
+    return text + (f" ({', '.join(episode['hit'])})" if episode["hit"] else "")
 
 
 def _count(number: int, what: str) -> str:

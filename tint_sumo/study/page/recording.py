@@ -19,7 +19,7 @@ from tint_sumo.core.ranges import Range
 from tint_sumo.core.reading import RESULT_BYTES
 from tint_sumo.core.structures import FieldError, build, plain
 from tint_sumo.envs.rows import Outcome
-from tint_sumo.films.driving import Moment, drive_case
+from tint_sumo.films.driving import Driven, Moment, drive_case
 from tint_sumo.films.trait_probe import TraitReader, fit_reader
 from tint_sumo.jobs import Workers, executor_of
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
@@ -32,7 +32,7 @@ from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.jobs import label, policy_folder, policy_path
 
 EPISODES = "episodes"  # folder of the recorded episodes in a study's folder
-FORMAT = 1  # number of the files' format
+FORMAT = 2  # number of the files' format
 MISSING = -32768  # a column's number where there is nothing to tell
 # What the numbers of each column are multiples of. A column holds the first number, then what each differs by.
 UNITS = {
@@ -85,6 +85,7 @@ class _StoredEpisode:
 
     outcome: Outcome
     time_s: Annotated[float, Range(0.0, 1e6)]
+    hit: tuple[str, str] | None  # trait and route of the driver that was hit
     frames: Annotated[int, Range(1, 1_000_000)]
     ego: dict[str, tuple[int, ...]]
     routes: dict[str, dict[str, tuple[int, ...]]]
@@ -166,9 +167,7 @@ class Recording:
         episodes = {}
         for done, case in enumerate(self.cases):
             report(Progress(done, len(self.cases), "case"))
-            episodes[str(case)] = encode(
-                list(drive_case(contender, case, CASES, **self.conditions.world)), reader, routes
-            )
+            episodes[str(case)] = encode(drive_case(contender, case, CASES, **self.conditions.world), reader, routes)
         content = {"recorded": self._identity, "episodes": episodes}
         write_text(self.file, json.dumps(content, separators=(",", ":")))
 
@@ -246,15 +245,18 @@ def _digest(policy: str | Path) -> str:
     return hashlib.sha256(weights_file(stem).read_bytes() + card.encode()).hexdigest()
 
 
-def encode(moments: Sequence[Moment], reader: TraitReader | None, routes: Sequence[str]) -> dict[str, Any]:
-    """An episode as small whole numbers: ``outcome``, ``time_s``, ``frames``, columns of the ``ego`` and of each
-    vehicle from its ``first`` frame on, and of each route the column ``claimed``.
+def encode(driven: Driven, reader: TraitReader | None, routes: Sequence[str]) -> dict[str, Any]:
+    """Return an episode as small whole numbers.
+
+    Its entries are ``outcome``, ``time_s``, ``hit``, ``frames``, columns of the ``ego`` and of each vehicle from its
+    ``first`` frame on, and the column ``claimed`` of each route.
     """
-    last = moments[-1]
+    case, moments = driven.case, driven.moments
     numbers = np.array([moment.vehicles for moment in moments])
     return {
-        "outcome": last.outcome,
-        "time_s": round(last.time_s, 3),
+        "outcome": case.outcome,
+        "time_s": case.time_s,
+        "hit": None if case.trait is None else [case.trait, case.route],
         "frames": len(moments),
         "ego": _ego(moments),
         "routes": {

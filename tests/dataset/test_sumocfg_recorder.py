@@ -177,7 +177,7 @@ def test_the_figure_of_many_vtypes_names_those_that_drive_and_has_room_for_them(
         (["--sumocfg", "{merge}", "--windows", "0"], "windows must lie in 1 to 100,000,000"),
         (["--sumocfg", "{merge}", "--p-conservative", "0.3"], "--p-conservative does not go with --sumocfg"),
         (["--sumocfg", "{merge}", "--format", "fcd"], "--format does not go with --sumocfg"),
-        (["--sumocfg", "{empty}"], "nobody drives in the first 50 s"),
+        (["--sumocfg", "{empty}"], "no vehicle drives in the first 50 s"),
         (["--sumocfg", "{wrong}"], "SUMO does not run"),
     ],
 )

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -11,30 +11,11 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import AnyMix, Mix, Population, find_population, population_name
 from tint_sumo.core.structures import plain
-from tint_sumo.dataset.fcd import write_fcd
-from tint_sumo.dataset.schema import (
-    FCD,
-    SCHEMA_VERSION,
-    TABLES,
-    TRAJECTORIES,
-    Manifest,
-    read_shard,
-    shard_file,
-    shard_path,
-)
-from tint_sumo.dataset.shards import (
-    EPISODE_STEPS,
-    ShardContents,
-    has_tables,
-    record_dataset,
-    require_sizes,
-    shard_contents,
-    write_tables,
-)
+from tint_sumo.dataset.schema import SCHEMA_VERSION, Manifest
+from tint_sumo.dataset.shards import EPISODE_STEPS, record_dataset, require_sizes
 from tint_sumo.jobs import Workers
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
 from tint_sumo.scenes.geometry import Floats, Numbers
-from tint_sumo.scenes.layout import layout
 from tint_sumo.simulation.scene import SceneSimulation
 
 EPISODES_PER_SHARD = 16
@@ -49,6 +30,8 @@ class Recording:
     population: Population | None = None  # the scene's if not given
     seed: int = 0
     scene: str | Scene = T_INTERSECTION
+
+    episodes_per_shard: ClassVar[int] = EPISODES_PER_SHARD
 
     def __post_init__(self) -> None:
         require_sizes(self.windows, self.seed)
@@ -70,6 +53,13 @@ class Recording:
             "population": population_name(played.population) or plain(played.population),
             "seed": self.seed,
         }
+
+    @property
+    def episode_s(self) -> float:
+        return EPISODE_STEPS * self.played().step_s
+
+    def simulate(self, shard: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+        return simulate_episodes(_simulation(self.played()), self.seed, shard * EPISODES_PER_SHARD)
 
 
 def record(
@@ -98,36 +88,13 @@ def record(
     try:
         return record_dataset(
             out,
-            recording.settings(),
-            _Shards(recording, fcd, Path(out)),
-            episodes_per_shard=EPISODES_PER_SHARD,
-            episode_s=EPISODE_STEPS * recording.played().step_s,
+            recording,
+            fcd=recording.played() if fcd else None,
             workers=workers,
             progress=progress,
         )
     finally:
         _simulations.clear()  # ends the simulation: libsumo is free again
-
-
-@dataclass(frozen=True)
-class _Shards:
-    """The shards of a recording."""
-
-    recording: Recording
-    fcd: bool
-    out: Path
-
-    def paths(self, number: int) -> tuple[str, ...]:
-        return tuple(shard_path(part, number) for part in (*TABLES, *([FCD] if self.fcd else [])))
-
-    def __call__(self, number: int) -> ShardContents:
-        if not has_tables(self.out, number):
-            simulation, first_episode = _simulation(self.recording.played()), number * EPISODES_PER_SHARD
-            write_tables(self.out, number, *simulate_episodes(simulation, self.recording.seed, first_episode))
-        if self.fcd and not shard_file(self.out, FCD, number).exists():
-            rows = read_shard(shard_file(self.out, TRAJECTORIES, number))
-            write_fcd(rows, shard_file(self.out, FCD, number), layout(self.recording.played()))
-        return shard_contents(self.out, number)
 
 
 _simulations: dict[Scene, SceneSimulation] = {}  # this process's, one at most: libsumo runs no more

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import pandas as pd
 import pyarrow as pa
@@ -24,6 +24,7 @@ from tint_sumo.core.files import claim_folder, whole_file, write_json
 from tint_sumo.core.progress import Progress
 from tint_sumo.core.provenance import versions
 from tint_sumo.core.stores import Store, is_url, working_folder
+from tint_sumo.dataset.fcd import write_fcd
 from tint_sumo.dataset.schema import (
     DRIVER_SCHEMA,
     DRIVERS,
@@ -34,6 +35,7 @@ from tint_sumo.dataset.schema import (
     TRAJECTORY_SCHEMA,
     Manifest,
     read_manifest,
+    read_shard,
     read_shard_metadata,
     shard_file,
     shard_number,
@@ -42,6 +44,8 @@ from tint_sumo.dataset.schema import (
 from tint_sumo.dataset.windows import count_windows
 from tint_sumo.jobs import Executor, Work, Workers, executor_of
 from tint_sumo.jobs.table import one_job
+from tint_sumo.scenes import Scene
+from tint_sumo.scenes.layout import layout
 
 EPISODE_STEPS = 500
 _WINDOWS_KEY = b"tint_sumo.windows"
@@ -68,30 +72,62 @@ def require_sizes(windows: int, seed: int) -> None:
         raise InputError(f"seed must not be negative: {seed}")
 
 
+class Recording(Protocol):
+    """A dataset to record: at least ``windows`` windows of traffic."""
+
+    @property
+    def windows(self) -> int: ...
+
+    @property
+    def episodes_per_shard(self) -> int: ...
+
+    @property
+    def episode_s(self) -> float: ...
+
+    def settings(self) -> dict[str, Any]:
+        """Return all that the dataset follows from."""
+
+    def simulate(self, shard: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+        """Return the rows of a shard: trajectories, by vehicle and time, and drivers."""
+
+
+@dataclass(frozen=True)
+class Shards:
+    """The shards of a recording, which are written as far as they are not in ``out`` already."""
+
+    recording: Recording
+    out: Path
+    fcd: Scene | None = None  # scene whose trajectories are written as floating-car data, too
+
+    def paths(self, number: int) -> tuple[str, ...]:
+        return tuple(shard_path(part, number) for part in (*TABLES, *([FCD] if self.fcd else [])))
+
+    def __call__(self, number: int) -> ShardContents:
+        if not all(shard_file(self.out, part, number).exists() for part in TABLES):
+            write_tables(self.out, number, *self.recording.simulate(number))
+        if self.fcd and not shard_file(self.out, FCD, number).exists():
+            rows = read_shard(shard_file(self.out, TRAJECTORIES, number))
+            write_fcd(rows, shard_file(self.out, FCD, number), layout(self.fcd))
+        return _shard_contents(self.out, number)
+
+
 def record_dataset(
-    out: str | Path,
-    settings: Mapping[str, Any],
-    shards: Work[ShardContents],
-    *,
-    episodes_per_shard: int,
-    episode_s: float,
-    workers: Workers = 1,
-    progress: bool = True,
+    out: str | Path, recording: Recording, *, fcd: Scene | None = None, workers: Workers = 1, progress: bool = True
 ) -> Manifest:
     """Record shards into ``out`` until they hold enough windows, or go on with that; return the dataset's manifest.
 
     Args:
         out: a new folder, or the one of this very recording, or its URL: shards then go there from where they are
             recorded.
-        settings: what the dataset follows from; ``windows`` of them are enough.
-        shards: records a shard by its number, as far as it is not there already.
-        episodes_per_shard, episode_s: what a shard consists of.
+        recording: what is recorded.
+        fcd: scene whose trajectories are written as floating-car data, too.
         workers: processes that simulate, or an executor.
         progress: show a progress bar on stderr.
 
     Raises:
         InputError: ``out`` holds another run, or the number of workers makes no sense.
     """
+    shards, settings = Shards(recording, Path(out), fcd), recording.settings()
     executor = executor_of(workers)
     store = Store.at(out)
     with (
@@ -102,21 +138,21 @@ def record_dataset(
         if finished is not None:
             return finished
         work = _Stored(shards, store) if is_url(out) else shards
-        found = _record(settings["windows"], work, executor, progress)
+        found = _record(recording.windows, work, executor, progress)
         _remove_shards_from(store, len(found))
         content = {
             **settings,
             **_contents(found),
             "sha256": _checksums(store, len(found)),
-            "windows_asked_for": settings["windows"],
-            "episodes": len(found) * episodes_per_shard,
-            "episode_s": episode_s,
+            "windows_asked_for": recording.windows,
+            "episodes": len(found) * recording.episodes_per_shard,
+            "episode_s": recording.episode_s,
         }
         write_json(folder / MANIFEST, content)
         return read_manifest(folder)
 
 
-def _finished(folder: Path, store: Store, shards: Work[ShardContents]) -> Manifest | None:
+def _finished(folder: Path, store: Store, shards: Shards) -> Manifest | None:
     """Return the manifest of a complete dataset."""
     if not (folder / MANIFEST).exists():
         return None
@@ -144,7 +180,7 @@ def _record(windows: int, shards: Work[ShardContents], executor: Executor, progr
 class _Stored:
     """Shards that are recorded in a temporary folder, and kept in a store."""
 
-    shards: Work[ShardContents]
+    shards: Shards
     store: Store
     out: Path = Path()  # nothing is left here
 
@@ -157,7 +193,7 @@ class _Stored:
             paths = self.shards.paths(number)
             held = {path: self.store.read(path) for path in paths if self.store.exists(path)}
             write_files(folder, held)
-            found = replace(self.shards, out=folder)(number)  # type: ignore[type-var]
+            found = replace(self.shards, out=folder)(number)
             for path in paths:
                 if path not in held:
                     self.store.write(path, (folder / path).read_bytes())
@@ -191,11 +227,7 @@ def _checksums(store: Store, shards: int) -> dict[str, str]:
     return {path: hashlib.sha256(store.read(path)).hexdigest() for path in paths}
 
 
-def has_tables(out: Path, shard: int) -> bool:
-    return all(shard_file(out, part, shard).exists() for part in TABLES)
-
-
-def shard_contents(out: Path, shard: int) -> ShardContents:
+def _shard_contents(out: Path, shard: int) -> ShardContents:
     """Return the counts of a shard, as its files have them."""
     trajectories, drivers = (read_shard_metadata(shard_file(out, table, shard)) for table in TABLES)
     return ShardContents(int(trajectories.metadata[_WINDOWS_KEY]), trajectories.num_rows, drivers.num_rows)

@@ -8,29 +8,22 @@ leaders that SUMO's drivers see; ``route`` is empty.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from tint_sumo.config import STEP_S
 from tint_sumo.core.errors import InputError
-from tint_sumo.dataset.schema import SCHEMA_VERSION, TABLES, Manifest, shard_path
-from tint_sumo.dataset.shards import (
-    EPISODE_STEPS,
-    ShardContents,
-    has_tables,
-    record_dataset,
-    require_sizes,
-    shard_contents,
-    write_tables,
-)
+from tint_sumo.dataset.schema import SCHEMA_VERSION, Manifest
+from tint_sumo.dataset.shards import EPISODE_STEPS, record_dataset, require_sizes
+from tint_sumo.dataset.windows import count_windows
+from tint_sumo.scenes.geometry import NO_VEHICLE
 from tint_sumo.scenes.sumocfg import SumoConfig, read_config, read_net, read_vtypes
 from tint_sumo.simulation.connection import Connection, connect
 from tint_sumo.simulation.sumocfg import Kinds, leader_of, refusals, sumo_options
 
 EPISODES_PER_SHARD = 4
-_NOBODY = -1
 
 
 @dataclass(frozen=True)
@@ -41,6 +34,9 @@ class SumocfgRecording:
     vtypes: tuple[str, ...]
     windows: int
     seed: int = 0
+
+    episodes_per_shard: ClassVar[int] = EPISODES_PER_SHARD
+    episode_s: ClassVar[float] = EPISODE_STEPS * STEP_S
 
     def settings(self) -> dict[str, Any]:
         return {
@@ -53,6 +49,17 @@ class SumocfgRecording:
             "population": list(self.vtypes),
             "seed": self.seed,
         }
+
+    def simulate(self, shard: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+        episodes = range(shard * EPISODES_PER_SHARD, (shard + 1) * EPISODES_PER_SHARD)
+        tables = [_simulate_episode(self, episode) for episode in episodes]
+        trajectories, drivers = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
+        if count_windows(trajectories) == 0:
+            raise InputError(
+                f"{self.config.file}: no vehicle drives in the first {self.episode_s:g} s; let it begin when there is "
+                "traffic"
+            )
+        return trajectories, drivers.astype({"trait": "category"})
 
 
 def record_sumocfg(
@@ -70,40 +77,7 @@ def record_sumocfg(
     config = read_config(sumocfg)
     read_net(config.net_file, with_internal=False)
     recording = SumocfgRecording(config, read_vtypes(config), windows, seed)
-    return record_dataset(
-        out,
-        recording.settings(),
-        _Shards(recording, Path(out)),
-        episodes_per_shard=EPISODES_PER_SHARD,
-        episode_s=EPISODE_STEPS * STEP_S,
-        workers=workers,
-        progress=progress,
-    )
-
-
-@dataclass(frozen=True)
-class _Shards:
-    """The shards of a recording."""
-
-    recording: SumocfgRecording
-    out: Path
-
-    def paths(self, number: int) -> tuple[str, ...]:
-        return tuple(shard_path(table, number) for table in TABLES)
-
-    def __call__(self, number: int) -> ShardContents:
-        if not has_tables(self.out, number):
-            episodes = range(number * EPISODES_PER_SHARD, (number + 1) * EPISODES_PER_SHARD)
-            tables = [_simulate_episode(self.recording, episode) for episode in episodes]
-            trajectories, drivers = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
-            write_tables(self.out, number, trajectories, drivers.astype({"trait": "category"}))
-        found = shard_contents(self.out, number)
-        if found.windows == 0:
-            first = f"the first {EPISODE_STEPS * STEP_S:g} s"
-            raise InputError(
-                f"{self.recording.config.file}: nobody drives in {first}; let it begin when there is traffic"
-            )
-        return found
+    return record_dataset(out, recording, workers=workers, progress=progress)
 
 
 class _Row(NamedTuple):
@@ -113,7 +87,7 @@ class _Row(NamedTuple):
     time_s: float
     position_m: float
     speed_mps: float
-    leader: int  # -1 without one
+    leader: int  # NO_VEHICLE without one
     gap_m: float
 
 
@@ -157,10 +131,10 @@ class _Watch:
         self._numbers = numbers
         for vehicle_id, number in numbers.items():
             leader_id, gap_m = leader_of(self._connection, vehicle_id, self._kinds.of(vehicle_id))
-            leader = numbers.get(leader_id, _NOBODY)
+            leader = numbers.get(leader_id, NO_VEHICLE)
             position_m, speed_mps = vehicle.getDistance(vehicle_id), vehicle.getSpeed(vehicle_id)
             self._rows.append(
-                _Row(number, time_s, position_m, speed_mps, leader, gap_m if leader != _NOBODY else np.nan)
+                _Row(number, time_s, position_m, speed_mps, leader, gap_m if leader != NO_VEHICLE else np.nan)
             )
 
     def _meet(self, vehicle_id: str) -> int:
@@ -187,7 +161,7 @@ class _Watch:
             episode=episode,
             route=pd.Categorical.from_codes(np.zeros(len(rows), np.int8), pd.Index([""])),
             acceleration_mps2=rows.groupby("vehicle")["speed_mps"].diff() / STEP_S,
-            leader=pd.arrays.IntegerArray(leader, leader == _NOBODY),
+            leader=pd.arrays.IntegerArray(leader, leader == NO_VEHICLE),
         )
 
     def drivers(self, episode: int) -> pd.DataFrame:

@@ -156,7 +156,7 @@ def test_every_table_of_several_seeds_is_there(report: StudyReport) -> None:
     assert list(tables(report.markdown)) == [
         "Success by mix of drivers",
         "All outcomes",
-        "Who is hit",
+        "Collisions by trait and route",
         "Differences in success",
         "Other conditions and shorter trainings",
     ]
@@ -188,7 +188,7 @@ def test_the_outcome_table_has_intervals_and_the_paper_s_outcomes(report: StudyR
 
 
 def test_collisions_are_counted_in_a_thousand_cases(report: StudyReport) -> None:
-    table = tables(report.markdown)["Who is hit"]
+    table = tables(report.markdown)["Collisions by trait and route"]
     assert table[0] == ["method", "aggressive, lower"]
     assert table[1] == ["always go", "1000.0"]
     assert table[-1] == ["oracle", f"{1000 * (1 + 1 + 6) / 120:.1f}"]

@@ -1,4 +1,4 @@
-"""How trait models and policies fare in scenes they were not trained in."""
+"""Test trait models in scenes in which they were not trained."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -36,7 +36,7 @@ _POPULATIONS = ("traits", "continuous")
 
 @dataclass(frozen=True)
 class SceneStudy:
-    """What is recorded, and which trait models are trained and tested on it."""
+    """Settings of the comparison: recordings, and the trait models that are trained and tested on them."""
 
     windows: WindowCount = 60_000  # windows of each scene and population
     methods: Many[str] = ("vae", "cross_window", "morton", "classifier")
@@ -177,7 +177,7 @@ class TransferJob:
         return joined(parts), np.concatenate(labels)
 
     def _properties(self, scenes: Sequence[str], *, test: bool) -> tuple[Windows, Any]:
-        """The same for drivers without classes, and their desired speeds."""
+        """Return windows of drivers without classes, and their desired speeds, m/s."""
         parts, speeds_mps = [], []
         for scene in scenes:
             data = self.out / _data(scene, "continuous")
@@ -193,7 +193,7 @@ class TransferJob:
 
 @dataclass(frozen=True)
 class _SceneScore:
-    """How a model fared in a scene."""
+    """Result of a model in a scene."""
 
     scene: str
     accuracy: Fraction
@@ -202,7 +202,7 @@ class _SceneScore:
 
 @dataclass(frozen=True)
 class _Transfer:
-    """What a job writes: how its model fared in each scene."""
+    """Result file of a job: its model in each scene."""
 
     method: str
     trained_on: str

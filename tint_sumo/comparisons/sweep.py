@@ -45,7 +45,7 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is trained and tested: some methods with each combination of values, and some seeds of each."""
+    """Settings of a sweep: some methods with each combination of values, and some seeds of each."""
 
     settings: PpoSettings  # what no value is given for
     varied: Mapping[str, Sequence[Any]]  # the values by the name of the setting, one of SETTINGS
@@ -100,7 +100,7 @@ class Sweep:
 
     @property
     def tested(self) -> tuple[float, ...]:
-        """Where policies are tested: at each P(conservative) that they are trained for."""
+        """The conditions of the tests: each P(conservative) that policies are trained for."""
         return tuple(p for p in P_CONSERVATIVE if self.p_conservative.contains(Mix(p)))
 
 

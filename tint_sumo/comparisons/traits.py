@@ -32,7 +32,7 @@ _DATA, _CONTINUOUS_DATA = "dataset", "continuous"  # folders in a comparison's f
 
 @dataclass(frozen=True)
 class TraitStudy:
-    """What the comparison runs."""
+    """Settings of the comparison."""
 
     windows: WindowCount = 696_000  # paper IV-B
     settings: TraitSettings = TRAIT_BUDGETS["full"]
@@ -115,7 +115,7 @@ def _other_data(p_conservative: float) -> str:
 
 @dataclass(frozen=True)
 class CompareJob:
-    """Train one method with one seed at every noise, and see how well each model tells the traits apart."""
+    """Train one method with one seed at every noise, and measure how well each model separates the traits."""
 
     study: TraitStudy
     method: str

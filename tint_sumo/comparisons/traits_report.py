@@ -25,7 +25,7 @@ _WHAT = "result of a trait study"
 
 @dataclass(frozen=True)
 class _Comparison(TraitAccuracy):
-    """How well one training of a method tells the traits apart."""
+    """Accuracy of one training of a method."""
 
     method: str
     noise_m: NoiseM
@@ -37,7 +37,7 @@ class _Comparison(TraitAccuracy):
 
 @dataclass(frozen=True)
 class _Continuous:
-    """How well one training of a method gives what drivers without classes were drawn with."""
+    """R2 of one training of a method for the properties of drivers without classes."""
 
     method: str
     latent_size: LatentCount
@@ -50,7 +50,7 @@ _KINDS = {"comparison": _Comparison, "continuous": _Continuous}
 
 @dataclass(frozen=True)
 class TraitReport:
-    """What was written, and the tables themselves."""
+    """The tables, and the files that were written."""
 
     table: pd.DataFrame  # a row per method and noise; every measure's mean and standard deviation over the seeds
     markdown: str

@@ -45,7 +45,7 @@ class _Pcg64:
 
     @classmethod
     def of(cls, state: Mapping[str, Any]) -> "_Pcg64":
-        """As ``numpy.random.PCG64.state`` gives it."""
+        """Build it from ``numpy.random.PCG64.state``."""
         return cls(**state["state"], has_uint32=state["has_uint32"], uinteger=state["uinteger"])
 
     def to_numpy(self) -> dict[str, Any]:
@@ -56,7 +56,7 @@ class _Pcg64:
 
 @dataclass(frozen=True)
 class _EpisodeInfo:
-    """What Stable-Baselines3 logs of an episode: its return, its steps, and when it ended, in s."""
+    """Stable-Baselines3's record of an episode: its return, its steps, and the time of its end, s."""
 
     r: float
     l: int  # noqa: E741 - Stable-Baselines3's names
@@ -65,7 +65,7 @@ class _EpisodeInfo:
 
 @dataclass(frozen=True)
 class _State:
-    """What is no tensor."""
+    """The part of a checkpoint that is no tensor."""
 
     decisions: _Count
     updates: _Count  # epochs of PPO so far

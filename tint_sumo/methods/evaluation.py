@@ -27,7 +27,7 @@ _STOP = 0  # action of environments whose case is over
 
 @dataclass(frozen=True)
 class Case:
-    """How one episode went."""
+    """Result of one episode."""
 
     outcome: str  # success, timeout or collision
     time_s: float  # time of its end
@@ -40,7 +40,7 @@ StoredCase = tuple[Outcome, Annotated[float, Range(0.0, 1e6)], str | None, str |
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How a policy fared in a number of cases."""
+    """Results of a policy in a number of cases."""
 
     cases: tuple[Case, ...]
 
@@ -110,7 +110,7 @@ def evaluate(
         seed: which set of cases, 0 to 1000.
         first: number of the first case.
         batch: environments at a time.
-        report: told of the progress.
+        report: called with the progress.
 
     Raises:
         InputError: no episodes, too many, or a seed out of range.
@@ -147,7 +147,7 @@ def _first_episodes(policy: Policy, venv: VecEnv, first_seed: int, wanted: int) 
 
 
 def _shares(cases: Collection[Case]) -> dict[str, float]:
-    """What a report tells of the cases so far."""
+    """Return the shares of outcomes in the cases so far."""
     ends = Counter(case.outcome for case in cases)
     return {outcome: ends[outcome] / len(cases) for outcome in ("success", "collision")}
 

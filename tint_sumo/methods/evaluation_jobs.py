@@ -27,7 +27,7 @@ _SUFFIXES = (".safetensors", ".json", ".zip")
 
 @dataclass(frozen=True)
 class _Cases:
-    """What such a job writes."""
+    """Content of the file that such a job writes."""
 
     cases: tuple[StoredCase, ...]
 
@@ -82,7 +82,7 @@ class CasesJob:
         return ""
 
     def cases(self) -> tuple[Case, ...]:
-        """What came out."""
+        """Return the cases that the job has written."""
         return tuple(Case(*one) for one in read_record(self.file, "cases", _Cases, RESULT_BYTES).cases)
 
 

@@ -60,7 +60,7 @@ class Contender:
 def load_policy(name_or_path: str | Path, *, scene: AnyScene | None = None, allow_pickle: bool = False) -> Contender:
     """A hand-written rule or a shipped policy by its name, or a trained one by its folder or file.
 
-    The card, a .json file beside the weights, tells the method, and where the trait model is.
+    The card, a .json file beside the weights, names the method and the trait model.
 
     Args:
         name_or_path: name, folder of a training run, .safetensors file, or Stable-Baselines3's .zip file with the

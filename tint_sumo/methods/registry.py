@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Policy(Protocol):
-    """What drives the ego: a rule, or a Stable-Baselines3 policy."""
+    """Driver of the ego: a rule, or a Stable-Baselines3 policy."""
 
     def predict(
         self,
@@ -37,7 +37,7 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class Look:
-    """How a method is drawn in every figure, in the report and in films.
+    """Colour and marks of a method in every figure, in the report and in films.
 
     Colours are of middling lightness, to be seen on white and on black, and far apart with each kind of colour
     blindness. Markers and dashes differ, too.

@@ -100,7 +100,7 @@ class TimeToCollision:
 
 
 class _World:
-    """What the rule knows of a scene; the routes that the ego meets in the order in which it does."""
+    """Geometry of a scene for the rule, with the routes in the order in which the ego meets them."""
 
     def __init__(self, layout: Layout) -> None:
         zones, way = layout.zones, layout.ego.way
@@ -130,7 +130,7 @@ class _World:
         return nearest.reshape(centre_m.shape[:2]), along_m.reshape(centre_m.shape[:2])
 
     def ego_front_m(self, ego_m: Floats) -> Floats:
-        """How far the fronts of egos with these centres (N, 2) have come; (N,)."""
+        """Return the distances (N,) of the fronts of egos with these centres (N, 2) along their way, m."""
         along_m, _ = project(ego_m, self._ego_line)
         return np.asarray(np.interp(along_m, self._ego_centres_m, self._ego_fronts_m))
 

@@ -1,4 +1,4 @@
-"""The models that the package ships, as their cards tell of them."""
+"""The models that the package ships, with their cards."""
 
 import json
 from collections.abc import Mapping, Sequence

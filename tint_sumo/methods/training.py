@@ -49,7 +49,7 @@ RECENT_EPISODES = 500
 
 
 def snapshot_stem(out: Path, percent: int) -> Path:
-    """Where a run keeps its policy after some percent of the training, without suffix."""
+    """Return the path of a run's policy after some percent of the training, without suffix."""
     return out / (POLICY if percent == 100 else f"{POLICY}-{percent}")
 
 
@@ -90,7 +90,7 @@ def train_policy(
         with_zip: write the policy as Stable-Baselines3's policy.zip, too.
         film: makes a GIF of the policy in a file, for the TensorBoard log, such as
             ``tint_sumo.films.training_films.film_policy``; called with each of the kept policies.
-        report: told of the progress.
+        report: called with the progress.
 
     Returns:
         The path of policy.safetensors.
@@ -368,12 +368,12 @@ def read_curve(out: Path) -> list[list[str]]:
 
 
 def digest(encoder: TraitModel) -> str:
-    """What tells a trait model's weights from others."""
+    """Return a checksum of a trait model's weights."""
     return hashlib.sha256(safetensors.torch.save(encoder.state_dict())).hexdigest()
 
 
 def _traits_entries(encoder: TraitModel | None) -> dict[str, Any]:
-    """What the card says of the trait model beside the policy."""
+    """Return the card's entries about the trait model beside the policy."""
     if encoder is None:
         return {"traits": None, "traits_sha256": None}
     return {"traits": TRAITS, "traits_sha256": digest(encoder)}

@@ -1,4 +1,4 @@
-"""What a study runs: everything that sets its cost and its quality, in one place."""
+"""Budgets of studies: everything that sets their cost and their quality, in one place."""
 
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
@@ -60,7 +60,7 @@ class Conditions:
 
     @property
     def label(self) -> str:
-        """What differs from the conditions of the training, for tables and figures."""
+        """The values that differ from the conditions of the training, for tables and figures."""
         parts = [
             f"noise {self.position_noise_m:g} m" if self.position_noise_m else "",
             f"tau {self.tau_s:g} s" if self.tau_s is not None else "",

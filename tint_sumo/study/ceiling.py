@@ -1,4 +1,4 @@
-"""How many cases a careful driver can finish in time at best, whatever it knows."""
+"""The share of cases that a careful driver can finish in time at best, whatever it knows."""
 
 from dataclasses import replace
 
@@ -64,7 +64,7 @@ def way_m(layout: Layout) -> NDArray[np.float64]:
 
 
 def _openings(simulation: SceneSimulation) -> list[list[list[tuple[float, float]]]]:
-    """Of each replica and route: from when to when the next driver to reach the ego's way is one that yields.
+    """Find for each replica and route from when to when the next driver at the ego's way is one that yields.
 
     The replicas are driven to their time limit.
     """

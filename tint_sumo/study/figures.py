@@ -122,7 +122,7 @@ def _plot_line(axes: Axes, rows: Sequence[Summary], name: str) -> None:
 
 
 def _line_style(method: str, *, is_open: bool = False) -> dict[str, Any]:
-    """Return Matplotlib's arguments for a method's line; open markers tell a shipped policy from a trained one."""
+    """Return Matplotlib's arguments for a method's line; a shipped policy has open markers."""
     look = look_of(method)
     style = {"color": look.colour, "marker": look.marker, "linestyle": look.dash, "ms": 4.5, "lw": 1.3}
     return style | ({"markerfacecolor": "white"} if is_open else {})

@@ -1,4 +1,4 @@
-"""Where a study keeps what, as paths relative to its folder."""
+"""Paths of a study's files, relative to its folder."""
 
 DATASET = "dataset"
 RESULTS = "results"  # a file for each result

@@ -133,7 +133,7 @@ class EvaluateJob:
 
     @property
     def wanted(self) -> list[tuple[Conditions, int]]:
-        """Where it is tested, and with how many cases."""
+        """The conditions in which it is tested, and the number of cases in each."""
         return [(one, trials.episodes) for trials in self.trials for one in trials.conditions if self._meets(one)]
 
     def is_done(self) -> bool:
@@ -185,7 +185,7 @@ def policy_folder(method: str, mix: Mix, seed: int) -> str:
 
 
 def policy_path(out: Path, method: str, mix: Mix | None, seed: int, percent: int = 100) -> str | Path:
-    """Where a policy of the study in ``out`` is after some percent of its training; the name of one that was given."""
+    """Return the file of a policy of the study in ``out`` after part of its training, or a given policy's name."""
     if mix is None:
         return method
     return snapshot_stem(out / policy_folder(method, mix, seed), percent).with_suffix(".safetensors")

@@ -20,7 +20,7 @@ from tint_sumo.study.tables import Lines, Table
 
 @dataclass(frozen=True)
 class StudyReport:
-    """What was written, and the tables themselves."""
+    """The tables, and the files that were written."""
 
     rows: tuple[Row, ...]
     tables: tuple[Table, ...]
@@ -64,7 +64,7 @@ def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
     if main:
         tables.append(Table("Success by mix of drivers", _success_lines(main, ceilings), _SUCCESS_NOTE))
         tables.append(Table("All outcomes", _outcome_lines(main), _OUTCOME_NOTE))
-        tables.append(Table("Who is hit", _collision_lines(main), _COLLISION_NOTE))
+        tables.append(Table("Collisions by trait and route", _collision_lines(main), _COLLISION_NOTE))
     if _compared(main):
         tables.append(Table("Differences in success", _difference_lines(main), _DIFFERENCE_NOTE))
     if varied:

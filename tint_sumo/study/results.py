@@ -1,4 +1,4 @@
-"""How the policies of a study fared, as files."""
+"""Results of a study's policies, as files."""
 
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass
@@ -20,7 +20,7 @@ TRAINED, GIVEN = "trained", "given"  # origin of a policy: the study itself, or 
 
 @dataclass(frozen=True)
 class Measured:
-    """How a policy fared under some conditions."""
+    """Result of a policy in one set of conditions."""
 
     conditions: Conditions
     evaluation: Evaluation
@@ -28,7 +28,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Result:
-    """How one policy fared: one method, mix of drivers in training, and seed."""
+    """Results of one policy: one method, mix of drivers in training, and seed."""
 
     method: str
     origin: str  # TRAINED or GIVEN
@@ -66,7 +66,7 @@ class Result:
 
 @dataclass(frozen=True)
 class _StoredTest:
-    """What a file says of a test: its conditions, its cases, and what follows from those."""
+    """A test as a file holds it: its conditions, its cases, and the rates that follow from them."""
 
     p_conservative: Mix
     position_noise_m: NoiseM
@@ -97,7 +97,7 @@ class _StoredTest:
 
 @dataclass(frozen=True)
 class _Stored:
-    """What a file says of a result."""
+    """A result as a file holds it."""
 
     method: str
     origin: Literal["trained", "given"]

@@ -27,7 +27,7 @@ CONDITION_TITLES = {  # what can differ from the conditions of the training
 
 @dataclass(frozen=True)
 class Summary(ABC):
-    """What tables, figures and files show of policies that differ by their training's seed alone."""
+    """Numbers in tables, figures and files about policies that differ by their training's seed alone."""
 
     method: str
     origin: str

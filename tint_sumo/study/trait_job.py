@@ -19,7 +19,7 @@ SEED = 0  # seed of the dataset and of the trait models
 
 @dataclass(frozen=True)
 class TraitJob:
-    """Train a trait model on the study's dataset and see how well it tells the traits apart."""
+    """Train a trait model on the study's dataset and measure how well its latents separate the traits."""
 
     method: str
     settings: TraitSettings
@@ -52,4 +52,4 @@ class TraitJob:
         plot_traits(data, self.folder, self.folder)
         add_to_card(self.folder / "model.safetensors", {"accuracy": found["accuracy"]})
         write_json(self.folder / "evaluation.json", found)
-        return f"{percent(found['accuracy'])}% of {found['windows']} unseen windows told apart"
+        return f"{percent(found['accuracy'])}% of {found['windows']} unseen windows put into the right class"

@@ -120,7 +120,7 @@ def condition_charts(rows: Sequence[Summary]) -> list[Chart]:
 
 
 def _rates(rows: Sequence[Summary], outcome: str) -> tuple[list[float], list[tuple[float, float]]]:
-    """Of each row, in percent: the rate, and the ends of its interval."""
+    """Return the rate of each row and the ends of its interval, in percent."""
     limits = [row.intervals[outcome] for row in rows]
     return (
         [round(100 * row.rate(outcome), 2) for row in rows],

@@ -32,7 +32,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Choice:
-    """What is shown: all policies on the same cases."""
+    """Policies and cases of the player: all policies on the same cases."""
 
     conditions: Conditions
     policies: tuple[Shown, ...]

@@ -27,7 +27,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Recordings:
-    """What the player can show."""
+    """Policies and episodes that the player can show."""
 
     scene: str | Scene
     choice: Choice
@@ -57,7 +57,7 @@ def record_episodes(out: Path, scene: str | Scene, choice: Choice, *, workers: W
 
 
 def player_data(recordings: Recordings) -> str:
-    """What the player's script reads: a table of contents, and each episode by its own."""
+    """Return the data for the player's script: a table of contents, and each episode by itself."""
     contents = {
         "units": UNITS,
         "missing": MISSING,
@@ -88,7 +88,7 @@ def _opening(policies: Sequence[Recorded]) -> Shown:
 
 
 def player_notes(recordings: Recordings) -> str:
-    """What a reader should know of the recorded episodes."""
+    """Return notes for readers about the recorded episodes."""
     choice = recordings.choice
     parts = [
         paragraph(
@@ -101,7 +101,7 @@ def player_notes(recordings: Recordings) -> str:
 
 
 def failure_lists(recordings: Recordings) -> str:
-    """Of each policy that failed: how often, and folded its recorded failures as buttons that open the player."""
+    """Return how often each policy failed, with its recorded failures, folded, as buttons that open the player."""
     return "".join(_failures(one) for one in recordings.policies)
 
 
@@ -111,13 +111,13 @@ def _failures(one: Recorded) -> str:
     failed = {case: episode for case, episode in one.episodes.items() if episode["outcome"] in FAILURES}
     if not failed and not any(counts.values()):
         return ""
-    told = " and ".join(_count(number, outcome) for outcome, number in counts.items())
+    counted = " and ".join(_count(number, outcome) for outcome, number in counts.items())
     buttons = [
         f'<button type="button" data-policy="{escape(one.policy.label)}" data-case="{case}">'
         f"{escape(_failure(case, episode))}</button>"
         for case, episode in failed.items()
     ]
-    summary = f"{one.policy.title}: {told} in {len(cases)} cases; {len(failed)} of them recorded"
+    summary = f"{one.policy.title}: {counted} in {len(cases)} cases; {len(failed)} of them recorded"
     return folded(summary, bullets(buttons)) if buttons else paragraph(summary)
 
 

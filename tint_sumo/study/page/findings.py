@@ -1,4 +1,4 @@
-"""What a reader should know before all tables: what P means, and what came out, in a few sentences."""
+"""The meaning of P and the main results, in a few sentences before all tables."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from tint_sumo.study.summary import Summary, at_mixes, by_title, over_all_mixes
 
 MEANING_OF_P = (
     "P is P(conservative): the probability that a driver is conservative, and yields when the ego moves in front of "
-    "it. All other drivers are aggressive and do not yield. Only the method oracle is told who is who."
+    "it. All other drivers are aggressive and do not yield. Only the method oracle knows who is who."
 )
 
 

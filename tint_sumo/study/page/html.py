@@ -63,7 +63,7 @@ def json_data(name: str, value: Any) -> str:
 
 
 def packed(name: str, text: str) -> str:
-    """The same for text that is long: compressed, in Base64."""
+    """Return the same element for long text: compressed, in Base64."""
     content = base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode("ascii")
     return f'<script type="text/plain" id="{name}">{content}</script>'
 

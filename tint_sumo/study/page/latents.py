@@ -1,4 +1,4 @@
-"""What the latent space of each trait model holds, for the page's readers."""
+"""The latent space of each trait model as a part of the page."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -33,7 +33,7 @@ from tint_sumo.study.jobs import label, policy_folder, policy_path
 
 EPISODES = "episodes"  # folder of the recorded episodes in a study's folder
 FORMAT = 2  # number of the files' format
-MISSING = -32768  # a column's number where there is nothing to tell
+MISSING = -32768  # a column's number where a value is missing
 # What the numbers of each column are multiples of. A column holds the first number, then what each differs by.
 UNITS = {
     "x_m": 0.01,
@@ -55,7 +55,7 @@ _WHAT = "recorded episodes"
 
 @dataclass(frozen=True)
 class _Identity:
-    """What was recorded; compared as a whole with what is wanted."""
+    """Key of a recording; another key than the wanted one means that it is recorded anew."""
 
     format: int
     policy: str
@@ -81,7 +81,7 @@ class _StoredVehicle:
 
 @dataclass(frozen=True)
 class _StoredEpisode:
-    """What ``encode`` makes of an episode."""
+    """Result of ``encode``: an episode as the page stores it."""
 
     outcome: Outcome
     time_s: Annotated[float, Range(0.0, 1e6)]
@@ -94,7 +94,7 @@ class _StoredEpisode:
 
 @dataclass(frozen=True)
 class _Stored:
-    """What a file of recorded episodes holds, by the number of the case."""
+    """Content of a file of recorded episodes, by the number of the case."""
 
     recorded: _Identity
     episodes: dict[str, _StoredEpisode]
@@ -102,7 +102,7 @@ class _Stored:
 
 @dataclass(frozen=True)
 class Recording:
-    """How a policy drives in some cases, as a file."""
+    """A policy and the cases in which it is recorded, into a file."""
 
     method: str
     mix: Mix | None  # mix of its training; None: a rule or a shipped policy
@@ -237,7 +237,7 @@ def read_episodes(file: Path) -> dict[int, dict[str, Any]]:
 
 
 def _digest(policy: str | Path) -> str:
-    """What tells a policy's weights and its card from others; for a rule the package's version."""
+    """Return a checksum of a policy's weights and its card; for a rule the package's version."""
     if isinstance(METHODS.get(str(policy)), Rule):
         return tint_sumo.__version__
     stem = find_policy(policy)

@@ -39,7 +39,7 @@ _SCRIPTS = ("unpacking.js", "theme.js", "printing.js", "scene.js", "player.js", 
 
 @dataclass(frozen=True)
 class _Study:
-    """All that the page tells."""
+    """Everything that the page shows."""
 
     out: Path
     rows: tuple[Row, ...]
@@ -150,7 +150,12 @@ def _results(study: _Study, charts: list[Chart]) -> str:
     if not main:
         return _left_out("no policy was tested at a single mix of drivers")
     parts = [_shown(outcome_chart(main, outcome), charts) for outcome in ("success", "collision")]
-    for heading in ("Success by mix of drivers", "All outcomes", "Who is hit", "Differences in success"):
+    for heading in (
+        "Success by mix of drivers",
+        "All outcomes",
+        "Collisions by trait and route",
+        "Differences in success",
+    ):
         if heading in study.tables:
             parts.append(_table(study.tables[heading]))
     return "".join(parts)

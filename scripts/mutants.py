@@ -59,6 +59,7 @@ TESTS = {  # by the module that is broken
     "dataset/windows": "tests/dataset/test_windows.py",
     "traits/vae": "tests/traits/test_vae.py",
     "traits/cross_window": "tests/traits/test_cross_window.py -k 'not uncertainty'",
+    "traits/streaming": "tests/traits/test_streaming.py",
     "policy/loss": "tests/policy/test_loss.py",
     "policy/ppo": "tests/policy/test_ppo.py",
     "policy/buffer": "tests/policy/test_buffer.py",

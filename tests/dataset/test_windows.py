@@ -16,12 +16,7 @@ from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, NO_LEADER_GAP_M
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset import windows as module
 from tint_sumo.dataset.recorder import EPISODES_PER_SHARD, record, simulate_episodes
-from tint_sumo.dataset.schema import (
-    DRIVERS,
-    MANIFEST,
-    TRAJECTORIES,
-    TRAJECTORY_SCHEMA,
-)
+from tint_sumo.dataset.schema import DRIVERS, MANIFEST, TRAJECTORIES, TRAJECTORY_SCHEMA
 from tint_sumo.dataset.windows import (
     WindowFile,
     Windows,

@@ -58,3 +58,21 @@ def test_a_stream_says_the_same_as_the_windows_of_the_tracks_so_far(steps: int) 
     last = np.flatnonzero(np.diff(windows.driver, append=3))
     np.testing.assert_allclose(mean, expected.mean[last], atol=1e-4)
     np.testing.assert_allclose(std, expected.std[last], atol=1e-4)
+
+
+def test_a_track_that_is_forgotten_starts_anew_and_others_go_on() -> None:
+    model = load("cross_window")
+    assert isinstance(model, CrossWindow)
+    stream, fresh = TrackStream(model, 2), TrackStream(model, 2)
+    for step in range(30):
+        stream.advance(np.arange(2), np.full(2, 0.2 * step, np.float32), np.full(2, np.inf))
+    stream.forget(np.array([1]))
+    assert stream.steps.tolist() == [30.0, 0.0]
+    for step in range(20):
+        position_m = np.array([6.0 + 0.2 * step, 9.0 + 0.3 * step], np.float32)
+        mean, std = stream.advance(np.arange(2), position_m, np.full(2, np.inf))
+        new_mean, new_std = fresh.advance(np.arange(1, 2), position_m[1:], np.full(1, np.inf))
+        np.testing.assert_array_equal(mean[1], new_mean[0])
+        np.testing.assert_array_equal(std[1], new_std[0])
+    assert stream.steps.tolist() == [50.0, 20.0]
+    assert (std[0] < std[1]).all()

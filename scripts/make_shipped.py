@@ -98,7 +98,7 @@ def make_policies(work: Path) -> None:
 
 
 def ship_policy(run_stem: Path, method: Learned, rows: list[dict[str, Any]]) -> None:
-    """Copy a policy; its card names the shipped trait model, and tells how the method fared over all seeds."""
+    """Copy a policy; its card names the shipped trait model, and holds the method's results over all seeds."""
     shipped = DATA / "models" / "policies" / method.name
     copy(weights_file(run_stem), weights_file(shipped))
     shown = ("seeds", "episodes", "success", "timeout", "collision", "success_sd")

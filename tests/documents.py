@@ -1,4 +1,4 @@
-"""Runs what a page of the documentation tells its reader to type: ``python -m tests.documents PAGE.md``.
+"""Run the commands and the code on a page of the documentation: ``python -m tests.documents PAGE.md``.
 
 Blocks marked ``python`` and ``bash`` run in the page's order, in the present folder; Python blocks share their names.
 A ``text`` block after one of them is what it prints, where ``...`` stands for anything. A block that is followed by a

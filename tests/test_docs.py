@@ -1,4 +1,4 @@
-"""The README and the documentation: what they tell their readers to type works, and the site is whole."""
+"""The README and the documentation: their commands and code work, their names exist, and the site is whole."""
 
 import os
 import re
@@ -32,7 +32,7 @@ _FETCHED = re.compile(r"<(?:script|img|link rel=.stylesheet.)[^>]+(?:src|href)=.
         *(pytest.param(page, id=page.stem, marks=pytest.mark.long) for page in READ_LATER),
     ],
 )
-def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
+def test_commands_and_code_on_a_page_work(page: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.documents", str(page)]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)

@@ -49,10 +49,9 @@ from tint_sumo.scenes.layout import layout
 
 EPISODE_STEPS = 500
 _WINDOWS_KEY = b"tint_sumo.windows"
-# Measured on real shards, size and write time relative to pyarrow's defaults (snappy, dictionaries): splitting the
-# floats into byte streams halves the file (0.42) and takes a third of the time, as dictionaries of floats that hardly
-# repeat are not built in vain. zstd 3 then beats snappy (0.52), lz4 (0.46) and gzip in size; zstd 9 saves 4 % for
-# twice the time; delta encodings save nothing. All of them read in about the same time.
+# Compared on real shards with pyarrow's defaults (snappy, dictionaries): splitting the floats into byte streams makes
+# files half as large and quicker to write, as dictionaries of floats that hardly repeat are not built in vain. zstd 3
+# then beats snappy, lz4 and gzip in size, zstd 9 saves little for twice the time, and delta encodings save nothing.
 _FLOATS = [field.name for field in (*TRAJECTORY_SCHEMA, *DRIVER_SCHEMA) if pa.types.is_floating(field.type)]
 
 

@@ -95,7 +95,7 @@ def test_the_site_is_searched_and_read_from_a_folder(site: Path) -> None:
         page.click(".md-search__input")
         page.keyboard.type("headway")
         page.wait_for_selector(".md-search-result__link")
-        assert "Where it differs from the paper" in str(page.text_content(".md-search-result__list"))
+        assert "Differences from the paper" in str(page.text_content(".md-search-result__list"))
         page.click(".md-search-result__link >> nth=0")
         page.wait_for_url("file://**/explanation/*.html*")
         browser.close()

@@ -184,7 +184,7 @@ def test_a_damaged_dataset(
     assert "damaged" in refuse(capsys, "traits", "evaluate", "--model", trait_model, "--data", other)
     for argv in (f"dataset inspect {other}", f"record --windows 100 --out {other} --format fcd"):
         assert main(argv.split()) == 2
-        assert "is damaged" in capsys.readouterr().err.splitlines()[-1]  # behind the progress bar
+        assert "is damaged" in capsys.readouterr().err.splitlines()[-1]  # behind the line that the work begins
 
 
 def test_a_dataset_of_another_schema_version(

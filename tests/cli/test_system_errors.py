@@ -157,6 +157,8 @@ def test_a_limit_of_file_sizes_is_an_error(argv: str, tmp_path: Path, dataset: P
         ("traits infer --fcd DATA --model vae --out OUT/table.csv", 0),
         ("policy train --method oracle --config CONFIG/policy.yaml --steps 1 --out OUT/policy", 20_000),
         ("render --model always_go --out OUT/film.gif", 20_000),
+        ("render --model always_go --out OUT/film.mp4", 20_000),
+        ("render --model always_go --out OUT/film.mp4", 0),
         ("render --model always_go --out OUT/film.png", 20_000),
     ],
 )

@@ -64,7 +64,7 @@ def run_trait_study(study: TraitStudy, out: Path, *, workers: Workers = 2, progr
         study: sizes of all stages.
         out: a new folder, or the one of this very study.
         workers: processes at a time, or an executor.
-        progress: show progress bars on stderr.
+        progress: show the progress on stderr.
 
     Raises:
         InputError: ``out`` holds another run, or a stage was refused.

@@ -10,7 +10,7 @@ _SHARES = ("success", "timeout", "collision", "accuracy")  # measures that peopl
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a piece of work is."""
+    """Progress of a piece of work."""
 
     done: int
     total: int

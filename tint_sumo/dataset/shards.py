@@ -121,7 +121,7 @@ def record_dataset(
         recording: what is recorded.
         fcd: scene whose trajectories are written as floating-car data, too.
         workers: processes that simulate, or an executor.
-        progress: show a progress bar on stderr.
+        progress: show the progress on stderr.
 
     Raises:
         InputError: ``out`` holds another run, or the number of workers makes no sense.

@@ -1,6 +1,8 @@
 """Films and film strips of single cases."""
 
+import subprocess
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -139,16 +141,24 @@ def _palette(artist: Artist, moments: Sequence[Moment]) -> Image.Image:
 def _write_mp4(file: Path, artist: Artist, moments: Sequence[Moment], report: Report) -> None:
     import imageio_ffmpeg  # noqa: PLC0415 - of an extra
 
-    writer = imageio_ffmpeg.write_frames(file, SIZE_PX, fps=RENDER_FPS, output_params=["-f", "mp4"])
-    writer.send(None)
-    try:
-        for frame in _frames(artist, moments, report):
-            pixels = frame.tobytes()
-            writer.send(pixels)
-        for _ in range(round(_LAST_S * RENDER_FPS)):
-            writer.send(pixels)
-    finally:
-        writer.close()
+    width, height = SIZE_PX
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        *("-y", "-v", "error"),
+        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(RENDER_FPS), "-i", "-"),
+        *("-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", "25", "-f", "mp4", str(file)),
+    ]
+    pixels = b""
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        with suppress(BrokenPipeError):  # it has ended, and says why
+            for frame in _frames(artist, moments, report):
+                pixels = frame.tobytes()
+                process.stdin.write(pixels)
+            process.stdin.write(pixels * round(_LAST_S * RENDER_FPS))
+        _, printed = process.communicate()
+    if process.returncode != 0:  # imageio_ffmpeg's own writer would leave half a film in silence
+        raise OSError(f"ffmpeg failed on {file.parent}: {' '.join(printed.decode(errors='replace').split())}")
 
 
 _WRITERS = {".mp4": _write_mp4, ".gif": _write_gif, ".png": _write_strip}

@@ -53,7 +53,7 @@ def run_study(
         out: a new folder, or the one of this very study.
         scene: where everybody drives; the shipped policies, which know the paper's scene, are tested there alone.
         workers: processes at a time, or an executor.
-        progress: show progress bars on stderr.
+        progress: show the progress on stderr.
 
     Raises:
         InputError: ``out`` holds another run, the scene does not fit the budget, or a stage was refused.

@@ -58,7 +58,7 @@ def write_page(report: StudyReport, out: Path, *, workers: Workers = 2, progress
         report: of the study.
         out: the study's folder.
         workers: processes at a time that record, or an executor.
-        progress: show progress bars on stderr.
+        progress: show the progress on stderr.
 
     Returns:
         The report with the page's file.

@@ -152,7 +152,7 @@ def test_the_observation_is_what_the_table_says(env: SceneEnv) -> None:
     assert len(slots) >= 6
 
 
-def test_where_the_vehicles_are_seen_on_their_routes_is_told_if_asked_for(env: SceneEnv) -> None:
+def test_infos_contain_positions_on_routes_with_tracks(env: SceneEnv) -> None:
     """The ego has passed the lower lane once its centre is beyond the border at y = 4 m, and the upper one never."""
     assert not set(TRACKS) & env.reset(seed=5)[1].keys()
     env = SceneEnv(tracks=True, backend="traci")

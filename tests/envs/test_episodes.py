@@ -19,8 +19,8 @@ from tint_sumo.envs.episodes import (
     observation_space,
     require_arguments,
 )
-from tint_sumo.envs.rows import NOBODY
 from tint_sumo.scenes import find_scene
+from tint_sumo.scenes.geometry import NO_VEHICLE
 
 T = find_scene("t_intersection")
 GO, STOP = 2, 0
@@ -53,7 +53,7 @@ def test_without_settings_the_scene_is_as_it_is() -> None:
         ({"tau_s": 1.5}, "population", replace(T.population, idm=replace(T.population.idm, tau_s=1.5))),
     ],
 )
-def test_a_setting_stands_in_place_of_the_scene_s_own(settings: dict[str, Any], field: str, value: object) -> None:
+def test_a_setting_replaces_that_of_the_scene(settings: dict[str, Any], field: str, value: object) -> None:
     found = TaskSettings(**settings).played
     assert getattr(found, field) == value
     assert replace(found, **{field: getattr(T, field)}) == T
@@ -169,7 +169,7 @@ def test_empty_slots_have_no_trait_and_others_the_number_of_their_profile() -> N
         batch.begin(0, np.random.default_rng(0))
         row = batch.rows[0]
         assert set(row["traits"][row["mask"] == 1.0].tolist()) == {1}  # the second profile is the conservative one
-        assert set(row["traits"][row["mask"] == 0.0].tolist()) == {NOBODY} == {-1}
+        assert set(row["traits"][row["mask"] == 0.0].tolist()) == {NO_VEHICLE} == {-1}
 
 
 def test_actions_are_numbers_of_desired_speeds() -> None:
@@ -207,7 +207,7 @@ def test_a_parked_environment_stands_until_its_next_episode() -> None:
         assert batch.steps.tolist() == [6, 1] and batch.simulation.egos.speed_mps[1] > 0.0
 
 
-def test_a_collision_is_told_when_the_episode_has_ended_with_it() -> None:
+def test_an_episode_that_ended_with_a_collision_has_its_details() -> None:
     with episodes(1, p_conservative=0.0) as batch:
         for seed in range(9):
             batch.begin(0, np.random.default_rng(seed))

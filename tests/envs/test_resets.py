@@ -1,4 +1,4 @@
-"""An environment after a reset is like a new one, whatever came before."""
+"""Environments after a reset, which are like new ones whatever came before."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing

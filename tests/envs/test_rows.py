@@ -80,7 +80,7 @@ def test_the_reward_is_the_sum_of_its_terms(front_m: float, collided: bool, step
     assert row["reward"] == pytest.approx(sum(terms))
 
 
-def test_each_row_is_judged_by_its_own_numbers() -> None:
+def test_rows_are_judged_one_by_one() -> None:
     cases = list(product((0.0, BEYOND), (False, True), (1, 100)))
     rows = np.zeros(len(cases), row_type(1))
     front_m, collided, steps = (np.array(part) for part in zip(*cases, strict=True))
@@ -91,7 +91,7 @@ def test_each_row_is_judged_by_its_own_numbers() -> None:
     assert {outcome_name(row["outcome"]) for row in rows} == {"", *OUTCOMES}
 
 
-def test_an_end_is_told_wherever_it_is() -> None:
+def test_the_end_of_any_row_is_returned() -> None:
     for ended in ([False, False], [True, False], [False, True]):
         rows = np.zeros(2, row_type(1))
         still = np.zeros(2)
@@ -152,7 +152,7 @@ def test_a_decision_s_rewards_are_summed_up_and_its_end_is_kept() -> None:
     assert rows["outcome"].tolist() == [0, 3] and rows["time_s"].tolist() == [0.2, 0.1]
 
 
-def test_what_is_told_of_a_row() -> None:
+def test_infos_of_a_row() -> None:
     rows = np.zeros(2, row_type(2))
     rows["outcome"], rows["time_s"], rows["traits"], rows["goal"] = [0, 1], 0.3, [[1, -1], [0, 0]], 2.5
     going_on, over = map(fields_of, rows)

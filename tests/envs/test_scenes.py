@@ -1,4 +1,4 @@
-"""What holds for the environment of every scene."""
+"""Properties of the environments of all scenes."""
 
 import gymnasium
 import numpy as np
@@ -66,7 +66,7 @@ def test_a_picture_shows_road_ego_and_drivers(name: str) -> None:
         env.close()
 
 
-def test_any_scene_has_an_environment_without_a_name_of_its_own() -> None:
+def test_any_scene_has_an_environment_without_an_id() -> None:
     env = gymnasium.make(SCENE_ENV_ID, scene=find_scene("on_ramp"), time_limit_s=1.0)
     named = gymnasium.make(ENV_IDS["on_ramp"], time_limit_s=1.0, backend="traci")
     try:
@@ -80,7 +80,7 @@ def test_any_scene_has_an_environment_without_a_name_of_its_own() -> None:
 
 
 def test_environments_of_several_scenes_are_those_of_each_scene() -> None:
-    """Two scenes share an environment, each in a process of its own."""
+    """Two scenes share an environment, each in another process."""
     names = ["four_way", "roundabout"]
     both = SceneVectorEnv(4, names)
     try:

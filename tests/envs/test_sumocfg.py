@@ -1,4 +1,4 @@
-"""Environments of SUMO configurations, and coming back to where an episode was."""
+"""Environments of SUMO configurations, and snapshots of episodes."""
 
 import pickle
 from collections.abc import Callable, Iterator
@@ -33,8 +33,8 @@ def made(*args: Any, **settings: Any) -> Iterator[SceneEnv]:
         env.close()
 
 
-def told(answer: tuple[Any, ...]) -> list[Any]:
-    """Everything an environment tells, as things that can be compared."""
+def returned(answer: tuple[Any, ...]) -> list[Any]:
+    """Return all that an environment returned, as values that can be compared."""
     observation, *rest = answer
     info = rest.pop()
     terms = info.pop("reward_terms", {})
@@ -42,9 +42,9 @@ def told(answer: tuple[Any, ...]) -> list[Any]:
 
 
 def play(env: SceneEnv, seed: int, steps: int = STEPS) -> list[Any]:
-    """Random actions without a look at the end, so that all plays are equally long."""
+    """Take random actions, also beyond an episode's end, so that all plays are equally long."""
     actions = np.random.default_rng(seed).integers(3, size=steps)
-    return [told(env.step(action)) for action in actions]
+    return [returned(env.step(action)) for action in actions]
 
 
 @pytest.mark.parametrize("name", USER_NETWORKS)
@@ -120,7 +120,7 @@ def test_stable_baselines_has_them_too(user_network: Make) -> None:
 
 
 @pytest.mark.parametrize("settings", [{"p_conservative": 0.5}, {"tau_s": 1.5}])
-def test_nobody_but_the_configuration_says_who_drives(settings: dict[str, float], user_network: Make) -> None:
+def test_the_mix_of_a_configuration_cannot_be_changed(settings: dict[str, float], user_network: Make) -> None:
     with pytest.raises(InputError, match=r"leave (p_conservative|tau_s) out"):
         SceneEnv(user_network("merge").scene(), **settings)
 
@@ -138,7 +138,7 @@ def test_an_episode_goes_on_from_a_snapshot_as_it_did(name: str, user_network: M
         env.reset(seed=2)
         play(env, 2, 5)
         observation, info = env.restore(snapshot)
-        assert told((observation, info))[:3] == told(here)[:3]
+        assert returned((observation, info))[:3] == returned(here)[:3]
         assert play(env, 1) == went_on
         assert env.np_random.integers(1000) == drawn
         with made(scene, position_noise_m=0.1, tracks=True, time_limit_s=500.0, backend="traci") as other:

@@ -1,4 +1,4 @@
-"""The vector environment in every autoreset mode, beside gymnasium's own."""
+"""The vector environment in every autoreset mode, beside gymnasium's vectors."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -32,7 +32,7 @@ TASK: dict[str, Any] = {
 
 
 def drive(env: VectorEnv[Any, Any, Any], steps: int, seed: int) -> Iterator[tuple[Any, ...]]:
-    """All that an environment returns in so many steps, and its resets where it does not reset by itself."""
+    """Return all that an environment returns in so many steps, and its resets where it does not reset by itself."""
     yield env.reset(seed=seed)
     rng = np.random.default_rng(seed)
     for _ in range(steps):
@@ -54,7 +54,7 @@ def drive(env: VectorEnv[Any, Any, Any], steps: int, seed: int) -> Iterator[tupl
     ],
 )
 @pytest.mark.parametrize("mode", AutoresetMode)
-def test_each_mode_is_gymnasiums_own(mode: AutoresetMode, task: dict[str, Any], steps: int, outcomes: set[str]) -> None:
+def test_each_mode_is_as_gymnasiums(mode: AutoresetMode, task: dict[str, Any], steps: int, outcomes: set[str]) -> None:
     """Observations, rewards, ends and infos with their masks, field by field."""
     task = TASK | task
     ours = gymnasium.make_vec(ENV_ID, num_envs=3, autoreset_mode=mode.value, **task)
@@ -143,7 +143,7 @@ def test_an_unknown_mode_is_refused() -> None:
 
 
 @pytest.mark.parametrize("outcome", OUTCOMES)
-def test_a_collision_is_told_only_of_an_episode_that_it_ended(outcome: str) -> None:
+def test_only_an_episode_that_a_collision_ended_has_its_details(outcome: str) -> None:
     """An ego whose episode has ended otherwise may still be hit while others go on in the same decision."""
     with closing(SceneVectorEnv(1, time_limit_s=1.0)) as env:
         env.reset(seed=0)

@@ -111,7 +111,7 @@ except InputError as error:
     assert 'use render_mode="rgb_array", or make a film with tint-sumo render' in line
 
 
-def test_a_python_without_tkinter_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_python_without_tkinter_is_an_error_that_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tkinter", None)
     with pytest.raises(InputError, match=r"apt-get install python3-tk\); use render_mode=\"rgb_array\""):
         SceneEnv(render_mode="human")

@@ -29,7 +29,7 @@ def test_plain_sumo_runs_every_scene(name: str, routes: str, tmp_path: Path) -> 
     assert "collision" not in result.stderr.lower()
 
 
-def test_rebuilding_replaces_own_files_but_never_foreign_ones(tmp_path: Path) -> None:
+def test_rebuilding_replaces_written_files_and_no_others(tmp_path: Path) -> None:
     write_scene(tmp_path, T, replicas=2)
     write_scene(tmp_path, T, replicas=1)
     assert 'id="L.1"' not in (tmp_path / NET_FILE).read_text()

@@ -1,4 +1,4 @@
-"""What changes the digest of a scene, and what does not."""
+"""Changes of a scene that change its digest, and others."""
 
 from collections.abc import Iterator
 from copy import deepcopy
@@ -24,7 +24,7 @@ NOT_COUNTED = {"name", "title", "view", "traffic", "population", "time_limit_s",
 
 
 def owners(value: Any) -> Iterator[Any]:
-    """All dataclasses that a value is made of, itself included."""
+    """Yield all dataclasses that a value is made of, itself included."""
     if isinstance(value, tuple):
         for part in value:
             yield from owners(part)
@@ -35,7 +35,7 @@ def owners(value: Any) -> Iterator[Any]:
 
 
 def other(value: Any) -> Any:
-    """A value that differs a little."""
+    """Return a value that differs a little."""
     if isinstance(value, bool):
         return not value
     if isinstance(value, float):

@@ -127,7 +127,7 @@ def test_a_vehicle_whose_lane_position_drops_is_on_the_next_lane() -> None:
 
 
 def test_leaders_are_seen_on_shared_lanes_of_other_routes_and_nowhere_else() -> None:
-    """Route 0 has lanes of 10 m and 20 m; route 1 a lane of its own of 6 m, and then route 0's second one."""
+    """Route 0 has lanes of 10 m and 20 m; route 1 a separate lane of 6 m, and then route 0's second one."""
     lane_start_m = np.array([[0.0, 10.0], [0.0, 6.0]])
     nan = np.nan
     lane_on_route_m = np.array([[[0.0, 10.0], [nan, 10.0]], [[nan, 6.0], [0.0, 6.0]]])

@@ -1,4 +1,4 @@
-"""What follows from a scene: paths and conflict zones."""
+"""Paths and conflict zones of scenes."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -61,7 +61,7 @@ def test_the_ego_starts_beside_the_traffic_and_meets_every_route_before_its_goal
 
 
 def nearest_m(found: Layout, route: int, front_m: float) -> float:
-    """How close the ego comes on its way to a vehicle that stands with its front there."""
+    """Return how close the ego comes on its way to a vehicle that stands with its front there."""
     scene = found.scene
     egos = boxes(found.ego.way, np.arange(scene.ego.start_m, scene.ego.goal_m + 5.0, 0.02))
     standing = np.repeat(boxes(found.routes[route].way, np.array([front_m]))[None], len(egos), axis=0)

@@ -40,7 +40,7 @@ def test_replicas_are_copies_at_their_origins(net: sumolib.net.Net, replica: int
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_drivers_give_way_to_nobody_but_the_ego(scene: str, tmp_path: Path) -> None:
+def test_drivers_give_way_to_the_ego_alone(scene: str, tmp_path: Path) -> None:
     """The traffic's lanes have priority on every junction, so that its routes never hold each other."""
     write_scene(tmp_path, find_scene(scene), replicas=1)
     network = sumolib.net.readNet(str(tmp_path / NET_FILE), withInternal=True)

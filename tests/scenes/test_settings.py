@@ -1,4 +1,4 @@
-"""Scenes as files tell them."""
+"""Scenes in files."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -39,7 +39,7 @@ def changed(**settings: Any) -> Scene:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_scene_with_its_own_numbers_is_the_built_in_one(name: str) -> None:
+def test_a_scene_with_unchanged_numbers_is_the_built_in_one(name: str) -> None:
     assert read_scene({"base": name}) == name
     assert read_scene(plain(scene_settings(name))) == name
     assert read_described(described(name)) == name
@@ -52,7 +52,7 @@ def test_what_is_not_said_is_as_in_the_base() -> None:
     assert replace(scene, name=base.name, base="", ego=base.ego, time_limit_s=base.time_limit_s) == base
 
 
-def test_a_changed_scene_has_a_name_of_its_own() -> None:
+def test_a_changed_scene_has_another_name() -> None:
     assert changed(time_limit_s=20, name="short").name == "short"
     names = {changed(time_limit_s=limit_s).name for limit_s in (20, 30)}
     assert len(names) == 2
@@ -61,7 +61,7 @@ def test_a_changed_scene_has_a_name_of_its_own() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "tells_apart"),
+    ("settings", "differs"),
     [
         ({"claim": {"braking_mps2": 3}}, True),
         ({"step_s": 0.2}, True),
@@ -71,11 +71,11 @@ def test_a_changed_scene_has_a_name_of_its_own() -> None:
         ({"arrivals_per_s": 0.1}, False),
     ],
 )
-def test_the_digest_tells_roads_and_tasks_apart(settings: dict[str, Any], tells_apart: bool) -> None:
-    assert (changed(**settings).digest != digest_of("four_way")) == tells_apart
+def test_the_digest_differs_with_roads_and_tasks(settings: dict[str, Any], differs: bool) -> None:
+    assert (changed(**settings).digest != digest_of("four_way")) == differs
 
 
-def test_a_card_tells_all_of_a_changed_scene() -> None:
+def test_a_card_contains_all_settings_of_a_changed_scene() -> None:
     scene = changed(arrivals_per_s=0.2, population=[SHY, {**SHY, "name": "bold", "yields": False}], step_s=0.05)
     card = described(scene)
     assert (card["scene"], card["scene_digest"]) == (scene.name, scene.digest)

@@ -1,4 +1,4 @@
-"""Who comes, and when there is room for them; nothing is simulated."""
+"""Drivers who appear, and the room that they wait for; nothing is simulated."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -52,7 +52,7 @@ def test_all_drivers_of_a_profile_are_drawn() -> None:
     assert {many.take().member for _ in range(200)} == set(range(6))
 
 
-def test_where_nobody_yields_all_are_drawn_from() -> None:
+def test_all_members_are_drawn_from_where_no_profile_yields() -> None:
     scene = replace(T, population=Population((AGGRESSIVE,), members=2))
     assert pool(scene).by_trait == {True: [0, 1], False: [0, 1]}
     assert pool(played()).by_trait == {True: [YIELDING], False: [HASTY]}

@@ -108,7 +108,7 @@ AHEAD, BEHIND = (0.0, 5.0, 1.0, 0.0), (0.0, -5.0, 1.0, 0.0)
 def checked(
     now_m: list[float], before_m: list[float], vehicles: list[tuple[float, float, float, float]], rules: EgoRules
 ) -> tuple[bool, bool, int]:
-    """Whether one ego is unsafe, whether it has newly touched a vehicle, and which one."""
+    """Return whether an ego is unsafe, whether it has newly touched a vehicle, and the slot of that vehicle."""
     unsafe, hit = np.array([True]), np.array([-1])
     egos = boxes((0.0, 0.0, 0.0, 1.0))
     new = check_safety(np.array([now_m]), np.array([before_m]), egos, boxes(*vehicles)[None], rules, unsafe, hit)
@@ -174,7 +174,7 @@ def set_vehicle(slots: Slots, slot: int, route: int, front_m: float) -> None:
     place(np.array([front_m]), layout(T).routes[route].way, slots.box[0, slot : slot + 1])
 
 
-def test_an_ego_looks_around_and_tells_its_first_collision_alone() -> None:
+def test_looking_around_returns_the_first_collision_once() -> None:
     egos, slots = Egos(1, T), Slots(1, T.max_vehicles)
     set_ego(egos, T.ego.start_m)
     assert not egos.look_around(slots)
@@ -188,7 +188,7 @@ def test_an_ego_looks_around_and_tells_its_first_collision_alone() -> None:
     assert not egos.look_around(slots)
 
 
-def test_a_collision_that_is_known_is_not_told_again_when_another_ego_has_one() -> None:
+def test_a_known_collision_is_not_returned_with_that_of_another_ego() -> None:
     egos, slots = Egos(2, T), Slots(2, T.max_vehicles)
     egos.box[1] = egos.box[0] = (0.0, 0.0, 1.0, 0.0, 5.0, 2.0)
     slots.take(0, 1, member=0, number=0, length_m=5.0, width_m=2.0)

@@ -1,4 +1,4 @@
-"""Encounters of egos and drivers in SUMO: who yields, who drives on, and who hits whom."""
+"""Encounters of egos and drivers in SUMO: yielding, driving on, and collisions."""
 
 from dataclasses import replace
 
@@ -97,7 +97,7 @@ def test_only_drivers_that_can_stop_clear_of_the_egos_way_yield() -> None:
 @pytest.mark.parametrize("hesitates", [False, True])
 @pytest.mark.parametrize("name", SCENES)
 def test_ego_and_driver_never_wait_for_each_other(name: str, p_conservative: float, hesitates: bool) -> None:
-    """Nobody but standing drivers holds an ego that wants to drive for more than 3 s, at any time in any episode."""
+    """No standing driver holds an ego that wants to drive for more than 3 s, at any time in any episode."""
     replicas, rng = 32, np.random.default_rng(7)
     played = replace(find_scene(name), traffic=Traffic(Mix(p_conservative)))
     simulation = SceneSimulation(replicas, played)

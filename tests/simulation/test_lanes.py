@@ -1,4 +1,4 @@
-"""Where vehicles are on their routes; nothing is simulated."""
+"""Positions of vehicles on their routes; nothing is simulated."""
 
 import numpy as np
 import pytest

@@ -21,7 +21,7 @@ EGOS = ("front_m", "speed_mps", "collided")
 
 
 def state(simulation: SceneSimulation) -> dict[str, Any]:
-    """Copies of what is known of all replicas; what stands in empty slots is of no account."""
+    """Return a copy of the state of all replicas; empty slots are alike."""
     slots = {key: np.where(simulation.slots.present, getattr(simulation.slots, key), -1) for key in SLOTS}
     egos = {f"ego_{key}": getattr(simulation.egos, key).copy() for key in EGOS}
     return slots | egos | {"has_claimed": simulation.yielding.has_claimed.copy()}
@@ -35,7 +35,7 @@ DESIRED_MPS = np.array([0.0, 0.5, 3.0])
 
 
 def history(simulation: SceneSimulation, replica: int, seed: int, steps: int = 150) -> list[dict[str, Any]]:
-    """States of one replica under random actions that depend on the seed alone; other replicas stand."""
+    """Return states of one replica under random actions that depend on the seed alone; other replicas stand."""
     rng = np.random.default_rng(seed)
     simulation.reset(replica, seed)
     states = []
@@ -306,7 +306,7 @@ def careless(replicas: int, collision_options: Sequence[str]) -> SceneSimulation
 
 
 def hits_by_sumo(simulation: SceneSimulation) -> dict[int, int]:
-    """Replica to slot of the vehicles that SUMO says collide with an ego now."""
+    """Return the slots of vehicles that collide with an ego according to SUMO, by replica."""
     hits = {}
     for event in simulation.link.connection.simulation.getCollisions():
         pair = {event.collider, event.victim}
@@ -364,7 +364,7 @@ def test_traffic_is_the_same_whether_or_not_sumo_looks_for_collisions() -> None:
 
 
 def test_the_safety_check_misses_no_vehicle() -> None:
-    """It looks only at vehicles nearby; all of them, looked at one by one, say the same."""
+    """It measures distances of near vehicles alone; those of all vehicles give the same result."""
     replicas = 20
     simulation = SceneSimulation(replicas, T)
     try:
@@ -421,7 +421,7 @@ def test_a_scene_holds_at_most_twelve_vehicles() -> None:
         simulation.reset_to(0, [PlacedVehicle(0, 5.0, 0)] * 13)
 
 
-def test_a_range_gives_each_episode_a_mix_of_its_own() -> None:
+def test_a_range_gives_each_episode_another_mix() -> None:
     replicas = 60
     simulation = SceneSimulation(replicas, in_traffic((0.1, 0.9)), with_ego=False)
     try:
@@ -455,7 +455,7 @@ def test_a_scene_of_few_slots_begins_with_those_who_have_come_furthest() -> None
 
 
 def _fronts_at_the_beginning(slots: int) -> list[list[float]]:
-    """Of some episodes, in the order of the distances."""
+    """Return the fronts of vehicles at the beginning of some episodes, sorted."""
     simulation = SceneSimulation(1, replace(T, max_vehicles=slots), with_ego=False)
     fronts_m = []
     for seed in range(5):

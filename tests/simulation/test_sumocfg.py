@@ -31,7 +31,7 @@ def begun(scene: SumocfgScene, seed: int = 1, backend: Backend = "auto") -> Iter
 
 
 def drive(simulation: SumocfgSimulation, steps: int, desired_mps: float | None = None) -> Iterator[int]:
-    """Steps at the top speed, or another, until the ego has arrived or had a collision."""
+    """Yield steps at the top speed, or another, until the ego has arrived or had a collision."""
     scene = simulation.scene
     desired = np.array([scene.controller.desired_speeds_mps[-1] if desired_mps is None else desired_mps])
     for step in range(steps):
@@ -58,7 +58,7 @@ def test_the_ego_reaches_its_goal_in_every_network(user_network: Make) -> None:
 
 
 @pytest.mark.parametrize("name", ["braunschweig", "merge"])
-def test_slots_hold_the_nearest_vehicles_and_rest_between_two(name: str, user_network: Make) -> None:
+def test_slots_hold_the_nearest_vehicles_and_stay_empty_between_two(name: str, user_network: Make) -> None:
     sight_m = {"braunschweig": 60.0, "merge": 30.0}[name]
     scene = user_network(name).scene(max_vehicles=3, sight_m=sight_m)
     with begun(scene) as simulation:
@@ -128,7 +128,7 @@ def test_the_safety_check_holds_the_ego_behind_a_standing_vehicle(user_network: 
 
 
 def _with_standing_vehicle(network: UserNetwork, front_m: float) -> UserNetwork:
-    """The same without other traffic, and with a van on the ramp."""
+    """Return the network without other traffic, and with a van on the ramp."""
     folder = network.sumocfg.parent
     (folder / "standing.rou.xml").write_text(
         '<routes><vType id="van" length="7"/>'
@@ -199,13 +199,13 @@ def test_the_end_of_the_route_is_past_the_goal(user_network: Make) -> None:
         assert simulation.egos.collided[0] or simulation.egos.front_m[0] > scene.goal_m
 
 
-def test_vehicles_where_the_ego_starts_are_told(user_network: Make) -> None:
+def test_vehicles_at_the_start_of_the_ego_are_an_error(user_network: Make) -> None:
     scene = _with_standing_vehicle(user_network("merge"), 22.0).scene()
     with pytest.raises(InputError, match=r"no room at its start \(20 m\)"), begun(scene):
         pass
 
 
-def test_demand_that_sumo_refuses_is_told_in_one_line(user_network: Make) -> None:
+def test_demand_that_sumo_refuses_is_an_error_in_one_line(user_network: Make) -> None:
     network = user_network("merge")
     folder = network.sumocfg.parent
     (folder / "wrong.rou.xml").write_text(
@@ -219,7 +219,7 @@ def test_demand_that_sumo_refuses_is_told_in_one_line(user_network: Make) -> Non
         assert "\n" not in str(caught.value)
 
 
-def test_what_the_configuration_writes_is_left_unwritten(user_network: Make) -> None:
+def test_output_files_of_the_configuration_are_not_written(user_network: Make) -> None:
     network = user_network("merge")
     folder = network.sumocfg.parent
     more = '<output><tripinfo-output value="trips.xml"/><fcd-output value="fcd.xml"/></output>'
@@ -236,7 +236,7 @@ def test_there_is_one_simulation_per_process(user_network: Make) -> None:
 
 
 @pytest.mark.parametrize("backend", ["libsumo", "traci"])
-def test_an_ego_that_sumo_teleports_is_told(backend: Backend, user_network: Make) -> None:
+def test_an_ego_that_sumo_teleports_is_an_error(backend: Backend, user_network: Make) -> None:
     network = _with_standing_vehicle(user_network("merge"), 90.0)
     text = network.sumocfg.read_text().replace("</configuration>", '<time-to-teleport value="5"/></configuration>')
     impatient = network.sumocfg.with_name("impatient.sumocfg")

@@ -15,7 +15,7 @@ from tint_sumo.simulation.yielding import Yielding, update_claims
 
 
 class FakeLink:
-    """In place of SUMO: drivers at 2 m/s; keeps the reactions that it is given."""
+    """A link without SUMO: drivers at 2 m/s; it keeps the reactions that it is given."""
 
     def __init__(self) -> None:
         self.reactions: list[tuple[int, int, bool, float]] = []

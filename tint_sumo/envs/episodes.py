@@ -30,7 +30,6 @@ from tint_sumo.envs.rows import (
     BOUND,
     COLLISION,
     GOING_ON,
-    NOBODY,
     TRACKS,
     Rows,
     Scales,
@@ -42,7 +41,7 @@ from tint_sumo.envs.rows import (
     row_type,
 )
 from tint_sumo.scenes import T_INTERSECTION, Scene, SumocfgScene, find_scene
-from tint_sumo.scenes.geometry import Floats
+from tint_sumo.scenes.geometry import NO_VEHICLE, Floats
 from tint_sumo.simulation import make_simulation
 from tint_sumo.simulation.timing import StepPart, does
 
@@ -167,7 +166,7 @@ class Episodes:
         scene = settings.played
         self.simulation = make_simulation(num_envs, scene, settings.backend)
         self.rows = np.zeros(num_envs, row_type(scene.max_vehicles)) if rows is None else rows
-        traits = (*self.simulation.trait_of_member, NOBODY)  # the last one stands for empty slots
+        traits = (*self.simulation.trait_of_member, NO_VEHICLE)  # the last one stands for empty slots
         self._trait_of_member = np.array(traits, np.int8)
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
         self._scales = Scales(POSITION_SCALE_M, SPEED_SCALE_MPS, scene.step_s)

@@ -20,7 +20,6 @@ REWARD_TERMS = ("goal", "collision", "speed", "step")
 Outcome = Literal["success", "timeout", "collision"]
 OUTCOMES: tuple[str, ...] = get_args(Outcome)
 GOING_ON, _SUCCESS, _TIMEOUT, COLLISION = range(4)  # numbers of outcomes in rows: positions in OUTCOMES, plus 1
-NOBODY = -1  # the trait of an empty slot
 BOUND = 2.0  # limit of normalised observations: 40 m, 6 m/s
 
 Rows = NDArray[np.void]  # records (N,) of a row type
@@ -34,7 +33,7 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
             ("ego", np.float32, (4,)),
             ("vehicles", np.float32, (max_vehicles, 2)),
             ("mask", np.float32, slots),
-            ("traits", np.int8, slots),  # number of the driver's profile, or NOBODY
+            ("traits", np.int8, slots),  # number of the driver's profile, or NO_VEHICLE
             ("position_m", np.float64, slots),  # along the route, as observed; 0 in empty slots
             ("gap_m", np.float64, slots),  # gap to the leader, as observed; infinite without one
             ("passed", np.int8, slots),  # 1 where the ego has left the vehicle's route behind

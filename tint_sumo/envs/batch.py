@@ -47,11 +47,11 @@ def checked_snapshots(snapshots: Any, tasks: Sequence[str]) -> list[Snapshot]:
     Raises:
         InputError: they are no sequence of snapshots, one for each environment, or of other settings.
     """
-    if not isinstance(snapshots, Sequence) or not all(isinstance(one, Snapshot) for one in snapshots):
+    if not isinstance(snapshots, Sequence) or not all(isinstance(snapshot, Snapshot) for snapshot in snapshots):
         raise InputError(f"what snapshot() has returned can be restored, not {shown(snapshots)}")
     if len(snapshots) != len(tasks):
         raise InputError(f"{len(snapshots)} snapshots do not fit {len(tasks)} environments; give as many")
-    if [one.task for one in snapshots] != list(tasks):
+    if [snapshot.task for snapshot in snapshots] != list(tasks):
         raise InputError("the snapshot is of another scene or other settings; make this environment as that one")
     return list(snapshots)
 
@@ -124,8 +124,8 @@ class LocalBatch:
             return []
         ended = [self._ended(index) for index in self._over()]
         if self._autoreset_mode is AutoresetMode.SAME_STEP:
-            for one in ended:
-                self._begin(one.index)
+            for end in ended:
+                self._begin(end.index)
         return ended
 
     def _over(self) -> list[int]:
@@ -150,15 +150,15 @@ class LocalBatch:
     def restore(self, snapshots: Sequence[Snapshot]) -> None:
         """Simulate all episodes once more; they begin such that they end together."""
         self.park(np.ones(len(snapshots), bool))
-        for left in range(max(len(one.actions) for one in snapshots), -1, -1):
-            for index, one in enumerate(snapshots):
-                if len(one.actions) == left:
+        for left in range(max(len(snapshot.actions) for snapshot in snapshots), -1, -1):
+            for index, snapshot in enumerate(snapshots):
+                if len(snapshot.actions) == left:
                     rng, _ = seeding.np_random(0)
-                    rng.bit_generator.state = one.began
+                    rng.bit_generator.state = snapshot.began
                     self._rngs[index] = rng
                     self._begin(index)
             if left:
-                actions = [one.actions[-left] if left <= len(one.actions) else 0 for one in snapshots]
+                actions = [snapshot.actions[-left] if left <= len(snapshot.actions) else 0 for snapshot in snapshots]
                 self._actions.append(np.array(actions, _ACTION))
                 self.episodes.step(self._actions[-1])
 

@@ -74,7 +74,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...], choices: int) -> NDArr
         array.dtype.kind not in "iu"
         or array.shape != shape
         or not ((array >= 0) & (array < choices)).all()
-        or (isinstance(actions, list | tuple) and any(isinstance(one, bool | np.bool_) for one in actions))
+        or (isinstance(actions, list | tuple) and any(isinstance(action, bool | np.bool_) for action in actions))
     ):
         allowed = ", ".join(map(str, range(choices)))
         wanted = f"actions must be {shape[0]} of {allowed}" if shape else f"an action must be one of {allowed}"
@@ -103,7 +103,7 @@ def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
         InputError: there are not as many as environments, or one is no seed.
     """
     try:
-        seeds = [checked_seed(one) for one in seed]
+        seeds = [checked_seed(value) for value in seed]
     except TypeError:  # not iterable
         first = checked_seed(seed)
         return [None if first is None else first + index for index in range(num_envs)]

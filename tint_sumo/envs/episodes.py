@@ -131,7 +131,11 @@ def require_arguments(environment: type, task: Mapping[str, Any]) -> None:
         environment: a class whose further arguments are those of ``TaskSettings``.
         task: the further arguments.
     """
-    named = [one.name for one in signature(environment).parameters.values() if one.kind is not one.VAR_KEYWORD]
+    named = [
+        parameter.name
+        for parameter in signature(environment).parameters.values()
+        if parameter.kind is not parameter.VAR_KEYWORD
+    ]
     require_fields(task, dict.fromkeys([*named, *(field.name for field in fields(TaskSettings))]))
 
 

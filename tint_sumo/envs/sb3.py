@@ -71,15 +71,15 @@ class SceneVecEnv(VecEnv):
         rows, ended = self.env.advance(self._actions)
         self._keep_slots(rows)
         listed: list[dict[str, Any]] = [{"traits": traits, "outcome": ""} for traits in rows["traits"]]
-        for one in ended:
-            last = fields_of(one.row)
-            listed[one.index] |= {
+        for end in ended:
+            last = fields_of(end.row)
+            listed[end.index] |= {
                 "terminal_observation": observation_of(last),
                 "TimeLimit.truncated": last["truncated"],
                 "terminal_slots": {key: last[key] for key in self.env.slot_infos},
-                "outcome": one.outcome,
+                "outcome": end.outcome,
                 "time_s": last["time_s"],
-                **end_info(one.outcome, one.collision),
+                **end_info(end.outcome, end.collision),
             }
         done = rows["terminated"] | rows["truncated"]
         return observation_of(rows), rows["reward"].astype(np.float32), done, listed

@@ -90,9 +90,9 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         checked_count("the number of scenes", len(scenes), num_envs)
         require_render_mode(render_mode, self.metadata["render_modes"])
         require_arguments(SceneVectorEnv, task)
-        all_settings = [TaskSettings(one, **task) for one in scenes]
+        all_settings = [TaskSettings(found, **task) for found in scenes]
         settings = all_settings[0]
-        if len({one.played.max_vehicles for one in all_settings}) > 1:
+        if len({settings.played.max_vehicles for settings in all_settings}) > 1:
             raise InputError("scenes of one environment must observe the same number of vehicles; change max_vehicles")
         self._mode = _autoreset_mode(autoreset_mode)
         fps = render_fps(settings.decision_s)
@@ -158,12 +158,12 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             )
         rows, ended = self.advance(actions)
         if self._mode is AutoresetMode.SAME_STEP:
-            begun[[one.index for one in ended]] = True
+            begun[[end.index for end in ended]] = True
         infos = self._infos(rows)
         if not begun.all():  # an episode that begins has no rewards yet
             infos |= _masked({"reward_terms": _masked({term: rows[term] for term in REWARD_TERMS}, ~begun)}, ~begun)
-        for one in ended:
-            infos = self._add_info(infos, self._ending(one), one.index)
+        for end in ended:
+            infos = self._add_info(infos, self._ending(end), end.index)
         return observation_of(rows), rows["reward"], rows["terminated"], rows["truncated"], infos
 
     def advance(self, actions: NDArray[np.int64]) -> tuple[dict[str, NDArray[Any]], list[Ended]]:
@@ -176,9 +176,9 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         with self._calls:
             ended = self.batch.step(taken)
         rows = copied(self.batch.rows)
-        for one in ended:
+        for end in ended:
             for key in ("reward", "terminated", "truncated"):
-                rows[key][one.index] = one.row[key]
+                rows[key][end.index] = end.row[key]
         return rows, ended
 
     @property
@@ -186,8 +186,8 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         """Fingerprint of each environment's settings, which its snapshots have, too."""
         shares = shares_of(self.num_envs, len(self._settings))
         return [
-            one.fingerprint
-            for one, share in zip(self._settings, shares, strict=True)
+            settings.fingerprint
+            for settings, share in zip(self._settings, shares, strict=True)
             for _ in range(share.start, share.stop)
         ]
 
@@ -267,7 +267,10 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         attributes, snapshots = state
         vars(self).update(attributes)
         self._calls = copy(self._calls)
-        self._settings = [replace(one, backend="auto") if one.backend == "libsumo" else one for one in self._settings]
+        self._settings = [
+            replace(settings, backend="auto") if settings.backend == "libsumo" else settings
+            for settings in self._settings
+        ]
         if snapshots:
             self.restore(snapshots)
 
@@ -276,7 +279,7 @@ def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
     try:
         return AutoresetMode(mode)
     except ValueError:
-        choices = ", ".join(repr(one.value) for one in AutoresetMode)
+        choices = ", ".join(repr(choice.value) for choice in AutoresetMode)
         raise InputError(f"unknown autoreset_mode {mode!r}; choose one of {choices}") from None
 
 

@@ -69,16 +69,16 @@ class WorkerBatch:
     def step(self, actions: NDArray[np.integer]) -> list[Ended]:
         answers = self._ask("step", lambda share: (actions[share],))
         return [
-            replace(one, index=one.index + share.start)
+            replace(end, index=end.index + share.start)
             for share, answer in zip(self._shares, answers, strict=True)
-            for one in answer
+            for end in answer
         ]
 
     def park(self, mask: NDArray[np.bool_]) -> None:
         self._ask("park", lambda share: (mask[share],))
 
     def snapshot(self) -> list[Snapshot]:
-        return [one for share in self._ask("snapshot", lambda _: ()) for one in share]
+        return [snapshot for share in self._ask("snapshot", lambda _: ()) for snapshot in share]
 
     def restore(self, snapshots: Sequence[Snapshot]) -> None:
         self._ask("restore", lambda share: (snapshots[share],))

@@ -57,7 +57,7 @@ def _plain(value: Any) -> Any:
         return tuple(map(_plain, value))
     if isinstance(value, Real) and not isinstance(value, bool):
         return float(value)
-    kind = next((one.__name__ for one in type(value).__mro__ if one.__name__ in _LISTED), None)
+    kind = next((base.__name__ for base in type(value).__mro__ if base.__name__ in _LISTED), None)
     if kind is None:
         return value
     values = _values(value, kind)

@@ -152,7 +152,7 @@ def _lanes(net: Any, route: str, edges: Sequence[str]) -> list[Any]:
         raise InputError(f"route {route!r}: the network has no edge {unknown[0]!r}")
     lanes = [net.getEdge(edges[0]).getLane(0)]
     for before, after in pairwise(edges):
-        ways = [one for one in lanes[-1].getOutgoing() if one.getToLane().getEdge().getID() == after]
+        ways = [way for way in lanes[-1].getOutgoing() if way.getToLane().getEdge().getID() == after]
         if not ways:
             raise InputError(f"route {route!r}: no way leads from edge {before!r} to edge {after!r}")
         via = ways[0].getViaLaneID()

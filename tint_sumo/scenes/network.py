@@ -102,9 +102,11 @@ def plain_xml(network: Network, replicas: int, spacing_m: float = REPLICA_SPACIN
     """
     parts = [_Replica(network, index, replica_origin(index, spacing_m)) for index in range(replicas)]
     return PlainXml(
-        nodes=_document("nodes", (part.node(one) for part in parts for one in network.nodes)),
-        edges=_document("edges", (part.edge(one) for part in parts for one in network.edges)),
-        connections=_document("connections", (part.connection(one) for part in parts for one in network.connections)),
+        nodes=_document("nodes", (part.node(node) for part in parts for node in network.nodes)),
+        edges=_document("edges", (part.edge(edge) for part in parts for edge in network.edges)),
+        connections=_document(
+            "connections", (part.connection(connection) for part in parts for connection in network.connections)
+        ),
         left_hand=network.left_hand,
     )
 
@@ -144,10 +146,10 @@ class _Replica:
             f"{self._shape(edge.shape)}/>"
         )
 
-    def connection(self, one: Connection) -> str:
+    def connection(self, connection: Connection) -> str:
         # A place to wait in the middle of a junction would split its lane in two.
         lanes = 'fromLane="0" toLane="0" contPos="0"'
-        return f"<connection {self._ends(one.start, one.end)} {lanes}{self._shape(one.shape)}/>"
+        return f"<connection {self._ends(connection.start, connection.end)} {lanes}{self._shape(connection.shape)}/>"
 
 
 def sumo_program(program: str) -> str:

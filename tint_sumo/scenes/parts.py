@@ -17,7 +17,7 @@ def arc(centre: Point, radius_m: float, start_deg: float, end_deg: float) -> tup
     """Return points of a circle from one angle (0 east, 90 north) to another; clockwise if the second is smaller."""
     steps = max(1, round(abs(end_deg - start_deg) / _DEGREES_PER_POINT))
     angles = [math.radians(start_deg + (end_deg - start_deg) * step / steps) for step in range(steps + 1)]
-    return tuple((centre[0] + radius_m * math.cos(one), centre[1] + radius_m * math.sin(one)) for one in angles)
+    return tuple((centre[0] + radius_m * math.cos(angle), centre[1] + radius_m * math.sin(angle)) for angle in angles)
 
 
 def quarter_turns(points: tuple[Point, ...], times: int) -> tuple[Point, ...]:

@@ -44,7 +44,7 @@ def find_scene(scene: AnyScene) -> Scene | SumocfgScene:
 
 
 def require_built_in(work: str, scene: AnyScene, profiles: int | None = None) -> Scene:
-    """Return a scene whose roads and traffic this package makes, for work that needs such a one.
+    """Return a scene whose roads and traffic this package makes, as some work needs it.
 
     Args:
         work: beginning of the message, such as ``"a study"``.

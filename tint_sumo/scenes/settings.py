@@ -137,11 +137,11 @@ class SumocfgSettings:
 
     @classmethod
     def of(cls, scene: SumocfgScene) -> Self:
-        found = {one.name: getattr(scene, one.name) for one in fields(cls) if one.name != "sumocfg"}
+        found = {field.name: getattr(scene, field.name) for field in fields(cls) if field.name != "sumocfg"}
         return cls(sumocfg=scene.config.file, **found)
 
     def scene(self) -> SumocfgScene:
-        return from_sumocfg(**{one.name: getattr(self, one.name) for one in fields(self)})
+        return from_sumocfg(**{field.name: getattr(self, field.name) for field in fields(self)})
 
 
 def _digest(settings: Mapping[str, Any]) -> str:

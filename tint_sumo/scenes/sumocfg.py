@@ -222,7 +222,7 @@ def read_config(file: Path) -> SumoConfig:
     return SumoConfig(
         file=file,
         net_file=net_files[0],
-        demand_files=tuple(one for files in demand for one in files),
+        demand_files=tuple(file for files in demand for file in files),
         step_s=_seconds(options.get("step-length", str(_DEFAULT_STEP_S)), file),
         outputs=tuple(name for name in options if name.endswith("-output") or name in _OUTPUTS),
     )
@@ -303,7 +303,7 @@ def read_net(file: Path, *, with_internal: bool = True) -> Any:
     if version is None:
         raise InputError(f"{file} is not a SUMO network; give the scenario's .net.xml")
     if tuple(map(int, version)) > NET_VERSION:
-        found, known = (".".join(str(int(part)) for part in one) for one in (version, NET_VERSION))
+        found, known = (".".join(str(int(part)) for part in numbers) for numbers in (version, NET_VERSION))
         raise InputError(
             f"{file} is a network of version {found}, which is of a newer SUMO than the one installed (up to {known}); "
             "build it again with this one's netconvert"

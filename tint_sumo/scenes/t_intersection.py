@@ -157,7 +157,9 @@ def t_intersection_right() -> Scene:
             network,
             nodes=tuple(replace(node, x_m=-node.x_m, shape=mirrored_x(node.shape)) for node in network.nodes),
             edges=tuple(replace(edge, shape=mirrored_x(edge.shape)) for edge in network.edges),
-            connections=tuple(replace(one, shape=mirrored_x(one.shape)) for one in network.connections),
+            connections=tuple(
+                replace(connection, shape=mirrored_x(connection.shape)) for connection in network.connections
+            ),
             left_hand=False,
         ),
         ego=replace(ego, way=mirrored_x(ego.way)),

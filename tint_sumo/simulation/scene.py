@@ -73,7 +73,7 @@ class SceneSimulation(Simulation):
         self.clear(replica)
         placed = self._demand.begin(replica, sequence)
         if len(placed) > self.scene.max_vehicles:  # those who would have come last are not there yet
-            placed = sorted(placed, key=lambda one: -one.front_m)[: self.scene.max_vehicles]
+            placed = sorted(placed, key=lambda vehicle: -vehicle.front_m)[: self.scene.max_vehicles]
         self._populate(replica, placed)
 
     def reset_to(self, replica: int, vehicles: Sequence[PlacedVehicle]) -> None:

@@ -273,7 +273,7 @@ class SumocfgSimulation(Simulation):
             )
 
     def _road_of(self, replica: int, slot: int) -> str:  # noqa: ARG002 - there is but one
-        vehicle_id = next(one for one, taken in self.slot.items() if taken == slot)
+        vehicle_id = next(known for known, taken in self.slot.items() if taken == slot)
         return str(self.connection.vehicle.getRoadID(vehicle_id))
 
     def leaders(self, replicas: slice = slice(None)) -> tuple[Numbers, Floats]:

@@ -170,7 +170,7 @@ def set_ego(egos: Egos, front_m: float) -> None:
 
 
 def set_vehicle(slots: Slots, slot: int, route: int, front_m: float) -> None:
-    slots.take(0, slot, route=route, member=9, number=0, length_m=5.0, width_m=2.0)
+    slots.take(0, slot, route=route, member=9, number=0, size_m=(5.0, 2.0))
     place(np.array([front_m]), layout(T).routes[route].way, slots.box[0, slot : slot + 1])
 
 
@@ -191,11 +191,11 @@ def test_looking_around_returns_the_first_collision_once() -> None:
 def test_a_known_collision_is_not_returned_with_that_of_another_ego() -> None:
     egos, slots = Egos(2, T), Slots(2, T.max_vehicles)
     egos.box[1] = egos.box[0] = (0.0, 0.0, 1.0, 0.0, 5.0, 2.0)
-    slots.take(0, 1, member=0, number=0, length_m=5.0, width_m=2.0)
+    slots.take(0, 1, member=0, number=0, size_m=(5.0, 2.0))
     slots.box[0, 1] = egos.box[0]
     assert egos.look_around(slots) == [(0, 1)]
     egos.collision[0] = Collision(1, 0, "lower", 0.0, 0.0)
-    slots.take(1, 2, member=0, number=0, length_m=5.0, width_m=2.0)
+    slots.take(1, 2, member=0, number=0, size_m=(5.0, 2.0))
     slots.box[1, 2] = egos.box[1]
     assert egos.look_around(slots) == [(1, 2)]
 

@@ -25,7 +25,7 @@ def lanes(slots: Slots) -> LanePositions:
 
 
 def enter(lanes: LanePositions, slots: Slots, replica: int, slot: int, route: int, front_m: float) -> None:
-    slots.take(replica, slot, route=route, member=0, number=0, length_m=5.0, width_m=2.0)
+    slots.take(replica, slot, route=route, member=0, number=0, size_m=(5.0, 2.0))
     lanes.enter(replica, slot, front_m)
 
 

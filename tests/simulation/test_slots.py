@@ -7,14 +7,14 @@ from tint_sumo.scenes.geometry import NO_VEHICLE
 from tint_sumo.simulation.slots import Slots
 
 V = 12  # slots
-CAR = {"length_m": 5.0, "width_m": 2.0}
+CAR = (5.0, 2.0)
 
 
 @pytest.fixture
 def slots() -> Slots:
     """Two replicas, with a vehicle in slot 2 of the second one."""
     made = Slots(2, V)
-    made.take(1, 2, route=1, member=7, number=5, **CAR)
+    made.take(1, 2, route=1, member=7, number=5, size_m=CAR)
     return made
 
 
@@ -36,7 +36,7 @@ def test_a_slot_has_the_numbers_and_the_size_of_its_vehicle(slots: Slots) -> Non
 
 
 def test_a_slot_stays_empty_for_a_step(slots: Slots) -> None:
-    slots.take(1, 0, member=1, number=6, **CAR)
+    slots.take(1, 0, member=1, number=6, size_m=CAR)
     assert (slots.free(0), slots.free(1)) == (0, 1)
     slots.begin_step()
     slots.leave(1, 0)
@@ -48,12 +48,12 @@ def test_a_slot_stays_empty_for_a_step(slots: Slots) -> None:
 
 def test_where_all_slots_are_taken_none_is_free(slots: Slots) -> None:
     for slot in range(V):
-        slots.take(0, slot, member=0, number=slot, **CAR)
+        slots.take(0, slot, member=0, number=slot, size_m=CAR)
     assert (slots.free(0), slots.free(1)) == (NO_VEHICLE, 0)
 
 
 def test_a_cleared_replica_is_as_new_and_the_other_one_is_left_alone(slots: Slots) -> None:
-    slots.take(0, 2, member=3, number=1, **CAR)
+    slots.take(0, 2, member=3, number=1, size_m=CAR)
     slots.front_m[:] = 1.0
     slots.begin_step()
     fresh = Slots(2, V)

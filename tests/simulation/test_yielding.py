@@ -41,7 +41,7 @@ def faked() -> tuple[FakeLink, Yielding, Slots, Egos]:
     """Two replicas; in the second one, slot 0 and 1 hold drivers on the lower lane, of which the first one yields."""
     link, slots = FakeLink(), Slots(2, T.max_vehicles)
     for slot, (route, member) in enumerate([(LOWER, 0), (LOWER, 1), (UPPER, 0)]):
-        slots.take(1, slot, route=route, member=member, number=slot, length_m=5.0, width_m=2.0)
+        slots.take(1, slot, route=route, member=member, number=slot, size_m=(5.0, 2.0))
         slots.front_m[1, slot] = 8.0
     return link, unlinked(2, link, slots), slots, Egos(2, T)
 
@@ -78,7 +78,7 @@ def test_a_driver_who_enters_a_claimed_route_reacts(faked: tuple[FakeLink, Yield
     egos.front_m[1] = CLAIMS_LOWER_M
     yielding.update(egos)
     assert not link.reactions
-    slots.take(1, 0, route=LOWER, member=0, number=3, length_m=5.0, width_m=2.0)
+    slots.take(1, 0, route=LOWER, member=0, number=3, size_m=(5.0, 2.0))
     yielding.enter(1, 0, 2.0)
     yielding.enter(1, 2, 2.0)
     assert np.argwhere(yielding.reacts).tolist() == [[1, 0]]

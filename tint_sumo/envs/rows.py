@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -103,14 +104,7 @@ class TaskRules(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene | SumocfgScene, preset: RewardPreset) -> "TaskRules":
-        return cls(
-            scene.ego.goal_m,
-            round(scene.time_limit_s / scene.step_s),
-            preset.goal,
-            preset.collision,
-            preset.speed_weight_per_mps,
-            preset.step,
-        )
+        return cls(scene.ego.goal_m, round(scene.time_limit_s / scene.step_s), *astuple(preset))
 
 
 @compiled

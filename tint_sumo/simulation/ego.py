@@ -41,18 +41,8 @@ class EgoRules(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene | SumocfgScene) -> "EgoRules":
-        controller = scene.ego.controller
-        return cls(
-            controller.gain_per_s,
-            controller.accel_limit_mps2,
-            controller.braking_gain_per_s,
-            controller.braking_limit_mps2,
-            controller.unsafe_distance_m,
-            controller.closing_distance_m,
-            controller.closing_speed_mps,
-            controller.watches_behind,
-            scene.step_s,
-        )
+        *names, _ = cls._fields
+        return cls(**{name: getattr(scene.ego.controller, name) for name in names}, step_s=scene.step_s)
 
 
 class Egos:

@@ -112,15 +112,8 @@ class SceneSimulation(Simulation):
     def _add(self, replica: int, slot: int, placed: PlacedVehicle) -> None:
         driver, vehicle, number = self.population[placed.member], self.scene.vehicle, self.vehicle_count[replica]
         self.vehicle_count[replica] += 1
-        self.slots.take(
-            replica,
-            slot,
-            route=placed.route,
-            member=placed.member,
-            number=number,
-            length_m=vehicle.length_m,
-            width_m=vehicle.width_m,
-        )
+        size_m = vehicle.length_m, vehicle.width_m
+        self.slots.take(replica, slot, member=placed.member, number=number, size_m=size_m, route=placed.route)
         self.lanes.enter(replica, slot, placed.front_m)
         self._demand.enter(replica, placed.route, slot)
         self.link.add(replica, slot, number, placed.route, placed.front_m, driver)

@@ -35,14 +35,14 @@ class Slots:
         self._was_present: Bools = np.zeros(shape, bool)
 
     def take(
-        self, replica: int, slot: int, *, member: int, number: int, length_m: float, width_m: float, route: int = 0
+        self, replica: int, slot: int, *, member: int, number: int, size_m: tuple[float, float], route: int = 0
     ) -> None:
         """Put a vehicle into an empty slot; where it is follows."""
         self.present[replica, slot] = True
         self.route[replica, slot] = route
         self.member[replica, slot] = member
         self.vehicle_number[replica, slot] = number
-        self.length_m[replica, slot], self.width_m[replica, slot] = length_m, width_m
+        self.length_m[replica, slot], self.width_m[replica, slot] = size_m
 
     def leave(self, replica: int, slot: int) -> None:
         """Empty the slot of a vehicle that has left."""

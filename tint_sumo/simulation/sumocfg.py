@@ -40,8 +40,7 @@ class VehicleKind:
     """The numbers that all vehicles of a vType have."""
 
     member: int  # number of the vType
-    length_m: float
-    width_m: float
+    size_m: tuple[float, float]  # length and width
     min_gap_m: float
     tau_s: float
 
@@ -71,8 +70,7 @@ class Kinds:
         types = self._connection.vehicletype
         return VehicleKind(
             self._vtypes.index(vtype),
-            types.getLength(vtype),
-            types.getWidth(vtype),
+            (types.getLength(vtype), types.getWidth(vtype)),
             types.getMinGap(vtype),
             types.getTau(vtype),
         )
@@ -259,7 +257,7 @@ class SumocfgSimulation(Simulation):
         if slot != NO_VEHICLE:
             kind = self._kinds.of(vehicle_id)
             number = self._number.setdefault(vehicle_id, len(self._number))
-            self.slots.take(0, slot, member=kind.member, number=number, length_m=kind.length_m, width_m=kind.width_m)
+            self.slots.take(0, slot, member=kind.member, number=number, size_m=kind.size_m)
             self.slot[vehicle_id] = slot
         return slot
 

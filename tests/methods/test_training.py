@@ -457,7 +457,6 @@ def test_another_run_s_folder_is_refused(tmp_path: Path, tiny: PpoSettings) -> N
     ("method", "steps", "seed", "message"),
     [
         ("magic", 64, 0, "unknown method"),
-        ("ours", 64, 0, "ours is now called vae"),
         ("ttc", 64, 0, "hand-written rule"),
         ("oracle", 0, 0, "steps"),
         ("oracle", 64, -1, "seed"),
@@ -589,7 +588,7 @@ def test_a_shared_training_gives_the_same_actions_with_another_source(
         oracle, ma = (load_policy(tmp_path / method / name) for method in ("oracle", "ma"))
         actions, expected = (one.policy.predict(observation, deterministic=True)[0] for one in (ma, oracle))
         np.testing.assert_array_equal(actions, expected)
-        assert ma.p_conservative == (0.1, 0.9)
+        assert ma.p_conservative == Mix(0.1, 0.9)
         assert oracle.source is not None and isinstance(oracle.source(), OracleTraits)
         assert ma.source is not None and isinstance(ma.source(), ClassifierTraits)
     written = (tmp_path / "ma" / "policy.safetensors").read_bytes()

@@ -195,7 +195,7 @@ def _read_xml(file: Path, columns: FcdColumns) -> pd.DataFrame:
 
 
 class _XmlReader:
-    """Keeps numbers only; ids of vehicles and lanes once each."""
+    """Reader of XML that keeps numbers, and each id of a vehicle or lane once."""
 
     def __init__(self, file: Path, columns: FcdColumns) -> None:
         self._file = file

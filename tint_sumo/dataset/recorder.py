@@ -23,7 +23,7 @@ EPISODES_PER_SHARD = 16
 
 @dataclass(frozen=True)
 class Recording:
-    """What to record: at least ``windows`` windows of traffic with this mix of drivers."""
+    """Settings of a recording: at least ``windows`` windows of traffic with this mix of drivers."""
 
     windows: int
     p_conservative: Mix
@@ -97,11 +97,11 @@ def record(
         _simulations.clear()  # ends the simulation: libsumo is free again
 
 
-_simulations: dict[Scene, SceneSimulation] = {}  # this process's, one at most: libsumo runs no more
+_simulations: dict[Scene, SceneSimulation] = {}  # of this process, at most one: libsumo runs no more
 
 
 def _simulation(scene: Scene) -> SceneSimulation:
-    """This process's simulation; starting one for every shard would cost more than recording it."""
+    """Return this process's simulation; starting another for every shard would cost more than recording it."""
     if scene not in _simulations:
         _simulations.clear()
         _simulations[scene] = SceneSimulation(EPISODES_PER_SHARD, scene, with_ego=False)
@@ -127,7 +127,7 @@ def simulate_episodes(
         number[step], member[step], route[step] = slots.vehicle_number, slots.member, slots.route
         leading, gap_m[step] = simulation.leaders()
         leader[step] = np.where(leading < 0, -1, np.take_along_axis(number[step], leading, axis=1))
-    desired_mps = np.array([one.desired_speed_mps for one in simulation.population])[member]
+    desired_mps = np.array([driver.desired_speed_mps for driver in simulation.population])[member]
     speed_mps = _speeds_mps(front_m, number, desired_mps, scene.step_s)
 
     when, replica_at, slot = np.nonzero(number >= 0)
@@ -138,7 +138,7 @@ def simulate_episodes(
         {
             **keys,
             "time_s": at[0] * scene.step_s,
-            "route": pd.Categorical.from_codes(route[at], pd.Index([one.name for one in scene.routes])),
+            "route": pd.Categorical.from_codes(route[at], pd.Index([route.name for route in scene.routes])),
             "position_m": front_m[at],
             "speed_mps": speed_mps[at],
             "acceleration_mps2": _accelerations_mps2(speed_mps, number, scene.step_s)[at],
@@ -167,14 +167,14 @@ def _driver_rows(
 
 
 def _continues(number: Numbers) -> NDArray[np.bool_]:
-    """(T, R, V): the slot held the same vehicle one step before."""
+    """Return which slots (T, R, V) held the same vehicle a step before."""
     same = np.zeros(number.shape, bool)
     same[1:] = (number[1:] == number[:-1]) & (number[1:] >= 0)
     return same
 
 
 def _speeds_mps(front_m: Floats, number: Numbers, insertion_mps: Floats, step_s: float) -> Floats:
-    """SUMO's Euler update makes the displacement of a step exactly its speed times the step."""
+    """Return speeds (T, R, V): in SUMO's Euler update a step's displacement is exactly its speed times the step."""
     moved_m = np.zeros_like(front_m)
     moved_m[1:] = front_m[1:] - front_m[:-1]
     return np.where(_continues(number), moved_m / step_s, insertion_mps)

@@ -28,7 +28,7 @@ EPISODES_PER_SHARD = 4
 
 @dataclass(frozen=True)
 class SumocfgRecording:
-    """What to record: at least ``windows`` windows of a configuration's traffic."""
+    """Settings of a recording: at least ``windows`` windows of a configuration's traffic."""
 
     config: SumoConfig
     vtypes: tuple[str, ...]
@@ -92,7 +92,7 @@ class _Row(NamedTuple):
 
 
 def _simulate_episode(recording: SumocfgRecording, episode: int) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Rows of trajectories, by vehicle and time, and of drivers."""
+    """Return rows of trajectories, by vehicle and time, and of drivers."""
     config = recording.config
     with refusals(config):
         connection = connect(sumo_options(config, [recording.seed, episode], STEP_S))
@@ -108,7 +108,7 @@ def _simulate_episode(recording: SumocfgRecording, episode: int) -> tuple[pd.Dat
 
 
 class _Watch:
-    """What is seen of the vehicles of a running simulation, by their numbers in order of appearance.
+    """Rows and drivers of a running simulation; vehicles are numbered in order of appearance.
 
     One that SUMO takes off the road and puts back elsewhere appears anew.
     """

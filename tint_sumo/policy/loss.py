@@ -8,7 +8,7 @@ from torch.nn import functional
 
 @dataclass(frozen=True)
 class Decisions:
-    """B decisions of a rollout, and what the policy makes of them now."""
+    """B decisions of a rollout, with the policy's present probabilities and values."""
 
     log_probs: Tensor  # (B,) of the actions, now
     old_log_probs: Tensor  # (B,) of the actions, when they were taken

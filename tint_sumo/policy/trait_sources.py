@@ -16,6 +16,7 @@ from tint_sumo.traits.model import TraitModel
 from tint_sumo.traits.streaming import TrackStream
 
 Observation = dict[str, np.ndarray]
+_AGE_SCALE_S = 10.0  # a vehicle crosses the street in 15 to 20 s
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class OracleTraits(TraitSource):
     """The true traits, known at once: 1 at the number of the driver's profile, conservative first; else 0.
 
     Args:
-        profiles: how many there are in the scene's population.
+        profiles: their number in the scene's population.
     """
 
     def __init__(self, profiles: int = KINDS) -> None:
@@ -89,7 +90,7 @@ def one_hot(labels: np.ndarray, size: int) -> np.ndarray:
 
 
 class Encoder(Protocol):
-    """A trait model as far as windows need it."""
+    """The part of a trait model that reads windows."""
 
     latent_size: int
 
@@ -237,9 +238,6 @@ class StreamingTraits(TraitSource):
         self.traits[envs] = 0.0
         rows, slots = np.nonzero(present)
         self.traits[envs[rows], slots] = np.concatenate([mean, std, age[:, None]], axis=-1)
-
-
-_AGE_SCALE_S = 10.0  # a vehicle crosses the street in 15 to 20 s
 
 
 def _require_latent_size(model: Encoder) -> None:

@@ -18,6 +18,7 @@ from tint_sumo.scenes import T_INTERSECTION, find_scene
 
 TRAITS, TRUE_TRAITS = "traits", "true_traits"
 _NEEDED = frozenset({"ego", "vehicles", "mask"})
+_STOP = 0  # action of an episode that began within a decision
 
 OnStep = Callable[[Observation, list[dict[str, Any]]], None]  # takes observations, arrays (N, ...), and N infos
 
@@ -27,7 +28,7 @@ class TraitObservation(VecEnvWrapper):
 
     Args:
         venv: a ``tint_sumo.envs.sb3.SceneVecEnv``, or a wrapper around one.
-        source: where the traits come from; for one environment only.
+        source: of the traits; for this environment only.
         key: ``"traits"``, or ``"true_traits"`` for those that only a critic may see.
 
     Raises:
@@ -94,9 +95,6 @@ def _continued(arrays: dict[str, np.ndarray], last: dict[int, dict[str, np.ndarr
 def _dictionary(observation: Any) -> Observation:
     assert isinstance(observation, dict)
     return observation
-
-
-_STOP = 0  # action of an episode that began within a decision
 
 
 class ActionRepeat(VecEnvWrapper):
@@ -166,7 +164,7 @@ def policy_venv(
 
     Args:
         num_envs: number of environments.
-        source: where the traits in the observations come from; None leaves them out.
+        source: of the traits in the observations; None leaves them out.
         action_repeat: simulation steps per decision.
         critic_sees_true_traits: observe the true traits, too, under another key.
         monitored: count steps and rewards of each episode for Stable-Baselines3's logger.
@@ -202,19 +200,19 @@ def snapshot(venv: VecEnv) -> VenvSnapshot:
 
 
 def memories(venv: VecEnv) -> list[dict[str, Any]]:
-    """Return a copy of what the wrappers of ``policy_venv`` remember, from the outermost inwards."""
+    """Return a copy of all that the wrappers of ``policy_venv`` know, from the outermost inwards."""
     *wrappers, _ = _layers(venv)
     return copy.deepcopy([_memory(wrapper) for wrapper in wrappers])
 
 
-def restore(venv: VecEnv, there: VenvSnapshot) -> None:
-    """Go to where environments were that were made with the same arguments; they then go on as those did."""
+def restore(venv: VecEnv, saved: VenvSnapshot) -> None:
+    """Bring environments to the state of others that were made with the same arguments; they go on as those did."""
     *wrappers, base = _layers(venv)
     assert isinstance(base, SceneVecEnv)
-    base.restore(there.episodes)
-    for wrapper, saved in zip(wrappers, there.memories, strict=True):
+    base.restore(saved.episodes)
+    for wrapper, memory in zip(wrappers, saved.memories, strict=True):
         for name, array in _memory(wrapper).items():
-            array[...] = saved[name]
+            array[...] = memory[name]
 
 
 def _layers(venv: VecEnv) -> Iterator[VecEnv]:

@@ -214,7 +214,7 @@ class Policy:
 def world_of(
     contender: "Contender", p_conservative: MixFlag | None, noise_m: float, tau_s: float | None
 ) -> dict[str, Any]:
-    """Where a policy is evaluated: what is not given is that of its training."""
+    """Return the traffic for an evaluation; values that are not given are those of the policy's training."""
     return {
         "p_conservative": contender.p_conservative if p_conservative is None else Mix.parse(p_conservative),
         "position_noise_m": noise_m,

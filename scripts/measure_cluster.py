@@ -10,10 +10,11 @@ from statistics import median
 
 from ray.cluster_utils import Cluster
 
+from tint_sumo.config import Mix
 from tint_sumo.dataset.recorder import record
+from tint_sumo.envs import TaskSettings
 from tint_sumo.jobs.cluster import RayCluster, ray_cluster
 from tint_sumo.methods.evaluation_jobs import evaluate_on
-from tint_sumo.methods.loading import load_policy
 
 CPU_GROUPS = Path("/sys/fs/cgroup/cpu")
 PERIOD_US = 100_000
@@ -46,7 +47,7 @@ def recording_s(cluster: RayCluster) -> float:
 
 def evaluation_s(cluster: RayCluster) -> float:
     began_s = time.perf_counter()
-    evaluate_on(cluster, MODEL, load_policy(MODEL), {"p_conservative": 0.4}, EPISODES, 0, progress=False)
+    evaluate_on(cluster, MODEL, TaskSettings(p_conservative=Mix(0.4)), EPISODES, 0, progress=False)
     return time.perf_counter() - began_s
 
 

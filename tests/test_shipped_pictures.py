@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tint_sumo.envs import SceneEnv
+from tint_sumo.envs import SceneEnv, TaskSettings
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS, IMAGES = ROOT / "scripts", ROOT / "data" / "images"
@@ -46,7 +46,7 @@ def assert_pictures_are_shipped(folder: Path, names: set[str]) -> None:
 
 
 def test_an_ego_is_shown_among_the_traffic_and_clear_of_it(make_shipped: ModuleType) -> None:
-    env = SceneEnv("four_way_turn")
+    env = SceneEnv(TaskSettings("four_way_turn"))
     env.reset(seed=1)
     assert not make_shipped.is_clear_in_traffic(env.simulation)  # it stands before the traffic
     seen, outcome = [], ""

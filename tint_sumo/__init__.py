@@ -23,8 +23,8 @@ def _register(env_id: str, **scene: str) -> None:
     if env_id not in registry:
         register(
             id=env_id,
-            entry_point="tint_sumo.envs.scene_env:SceneEnv",
-            vector_entry_point="tint_sumo.envs.vector:SceneVectorEnv",
+            entry_point="tint_sumo.envs.entry_points:GymnasiumEnv",
+            vector_entry_point="tint_sumo.envs.entry_points:GymnasiumVectorEnv",
             kwargs=scene,
         )
 

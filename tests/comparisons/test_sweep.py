@@ -14,6 +14,7 @@ from tint_sumo.comparisons.sweep import Sweep, VariantJob, plan, read_varied, re
 from tint_sumo.config import CONSERVATIVE, Mix, Population, PpoSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import silent
+from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.evaluation import TUNING_CASES, evaluate
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.scenes import find_scene
@@ -60,7 +61,12 @@ def test_a_sweep_leaves_a_table_and_the_policies_of_each_variant(sweep: Sweep, f
 @pytest.mark.slow
 def test_policies_are_tested_on_cases_that_are_reported_nowhere(finished: Path) -> None:
     policy = load_policy(finished / VARIANTS[0] / "policies" / "oracle-P0.4-seed0")
-    expected = evaluate(policy.policy, lambda count: policy.make_venv(count, p_conservative=0.4), 3, TUNING_CASES)
+    expected = evaluate(
+        policy.policy,
+        lambda count: policy.make_venv(count, TaskSettings(policy.scene, p_conservative=0.4)),
+        3,
+        TUNING_CASES,
+    )
     result = Result.read(finished / VARIANTS[0] / "results" / "oracle-P0.4-seed0.json")
     assert (result.case_set, result.tested) == (TUNING_CASES, (Measured(Conditions(Mix(0.4)), expected),))
 

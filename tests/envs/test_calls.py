@@ -11,7 +11,7 @@ import torch
 
 from tests.envs.test_environments import ENV_ID, assert_equal
 from tint_sumo.core.errors import InputError
-from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 
 INTEGERS: tuple[Any, ...] = (
@@ -39,13 +39,13 @@ NO_INTEGERS: tuple[Any, ...] = (
 
 @pytest.fixture(scope="module")
 def env() -> Iterator[SceneEnv]:
-    with closing(SceneEnv(backend="traci")) as env:
+    with closing(SceneEnv(TaskSettings(backend="traci"))) as env:
         yield env
 
 
 @pytest.fixture(scope="module")
 def vector() -> Iterator[SceneVectorEnv]:
-    with closing(SceneVectorEnv(2, workers=2, backend="traci")) as vector:
+    with closing(SceneVectorEnv(2, TaskSettings(backend="traci"), workers=2)) as vector:
         yield vector
 
 
@@ -160,7 +160,7 @@ def test_the_wrong_moments(kind: str) -> None:
     snapshot = env.snapshot()
     env.close()
     env.close()
-    with closing(SceneEnv(backend="libsumo")) as other:  # libsumo is free again
+    with closing(SceneEnv(TaskSettings(backend="libsumo"))) as other:  # libsumo is free again
         other.reset(seed=0)
         for name in calls:
             with pytest.raises(InputError, match=r"^the environment is closed; make a new one$"):

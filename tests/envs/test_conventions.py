@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from tint_sumo import ENV_IDS, SCENE_ENV_ID
 from tint_sumo.core.errors import InputError
-from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.envs import SceneEnv, TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.scenes import T_INTERSECTION
 
@@ -66,29 +66,21 @@ def test_the_longest_episode_stands_in_the_specification(task: dict[str, Any], s
 @pytest.mark.parametrize(
     ("make", "valid"),
     [
-        (SceneEnv, "scene, render_mode, p_conservative"),
-        (lambda **task: gymnasium.make(ENV_ID, **task), "scene, render_mode, p_conservative"),
-        (SceneVectorEnv, "num_envs, scene, render_mode, workers, autoreset_mode, p_conservative"),
-        (lambda **task: gymnasium.make_vec(ENV_ID, **task), "num_envs, scene, render_mode, workers, autoreset_mode"),
-        (lambda **task: SceneVecEnv(2, **task), "num_envs, seed, scene, render_mode, workers, p_conservative"),
+        (gymnasium.make, "render_mode, scene, p_conservative"),
+        (gymnasium.make_vec, "num_envs, render_mode, workers, autoreset_mode, scene, p_conservative"),
     ],
 )
 def test_unknown_arguments_are_answered_with_the_valid_ones(make: Callable[..., Any], valid: str) -> None:
     with pytest.raises(InputError) as refused:
-        make(p_conservativ=0.3)
+        make(ENV_ID, p_conservativ=0.3)
     line = str(refused.value)
     assert "p_conservativ: there is no such setting; did you mean p_conservative?" in line
     assert valid in line and "\n" not in line
 
 
-def test_a_vector_for_stable_baselines3_has_but_one_mode() -> None:
-    with pytest.raises(InputError, match="autoreset_mode: there is no such setting"):
-        SceneVecEnv(2, autoreset_mode="Disabled")
-
-
 def test_an_action_holds_for_a_decision_or_until_the_episode_ends() -> None:
     task: dict[str, Any] = {"scene": "four_way_turn", "p_conservative": 0.5, "time_limit_s": 8.0, "tracks": True}
-    plain, decisive = SceneEnv(**task), SceneEnv(decision_s=0.7, backend="traci", **task)
+    plain, decisive = SceneEnv(TaskSettings(**task)), SceneEnv(TaskSettings(decision_s=0.7, backend="traci", **task))
     rng = np.random.default_rng(0)
     outcomes = set()
     with closing(plain), closing(decisive):
@@ -118,7 +110,7 @@ def test_an_action_holds_for_a_decision_or_until_the_episode_ends() -> None:
 
 
 def test_monitor_reads_successes() -> None:
-    env = Monitor(SceneEnv("on_ramp", p_conservative=0.5), info_keywords=("is_success",))
+    env = Monitor(SceneEnv(TaskSettings("on_ramp", p_conservative=0.5)), info_keywords=("is_success",))
     outcomes = set()
     with closing(env):
         for seed in (0, None, None):
@@ -134,7 +126,7 @@ def test_monitor_reads_successes() -> None:
 
 
 def test_evaluations_read_successes(tmp_path: Path) -> None:
-    task: dict[str, Any] = {"scene": "on_ramp", "p_conservative": 0.5}
+    task = TaskSettings("on_ramp", p_conservative=0.5)
     found: list[str] = []
 
     class Outcomes(SceneVecEnv):
@@ -145,7 +137,10 @@ def test_evaluations_read_successes(tmp_path: Path) -> None:
             found.extend(info["outcome"] for info in infos if info["outcome"])
             return *returned, infos
 
-    with closing(VecMonitor(Outcomes(1, seed=0, **task))) as tested, closing(VecMonitor(SceneVecEnv(1, **task))) as env:
+    with (
+        closing(VecMonitor(Outcomes(1, task, seed=0))) as tested,
+        closing(VecMonitor(SceneVecEnv(1, task))) as env,
+    ):
         model = PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, seed=0)
         model.policy.action_net.bias.data[GO] = 1000.0
         model.learn(4, EvalCallback(tested, n_eval_episodes=3, eval_freq=4, log_path=str(tmp_path), verbose=0))

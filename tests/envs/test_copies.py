@@ -18,7 +18,7 @@ from tests.envs.test_workers import assert_infos_equal
 from tests.scenes.networks import UserNetwork
 from tint_sumo import ENV_IDS, SCENE_ENV_ID
 from tint_sumo.core.errors import InputError
-from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.scenes import T_INTERSECTION
 
@@ -73,7 +73,7 @@ def test_a_copy_goes_on_like_the_original_which_does_not_notice(
 
 @copies
 def test_a_copy_takes_libsumo_where_it_is_free(copied: Copy) -> None:
-    with closing(SceneEnv(backend="traci")) as env:
+    with closing(SceneEnv(TaskSettings(backend="traci"))) as env:
         env.reset(seed=0)
         with closing(copied(env)) as twin:
             assert twin.simulation.backend == "traci"
@@ -87,7 +87,7 @@ def test_a_copy_takes_libsumo_where_it_is_free(copied: Copy) -> None:
 
 
 def _stepped(seed: int) -> tuple[Any, ...]:
-    with closing(SceneEnv(backend="traci")) as env:
+    with closing(SceneEnv(TaskSettings(backend="traci"))) as env:
         env.reset(seed=seed)
         return env.step(2)
 
@@ -123,9 +123,9 @@ def test_environments_without_an_episode_are_copied_as_they_are(copied: Copy, ma
 
 
 VECTORS: dict[str, Callable[[], Any]] = {
-    "one process": lambda: SceneVectorEnv(3, **TASK),
-    "workers": lambda: SceneVectorEnv(3, workers=2, **TASK),
-    "stable-baselines3": lambda: SceneVecEnv(3, **TASK),
+    "one process": lambda: SceneVectorEnv(3, TaskSettings(**TASK)),
+    "workers": lambda: SceneVectorEnv(3, TaskSettings(**TASK), workers=2),
+    "stable-baselines3": lambda: SceneVecEnv(3, TaskSettings(**TASK)),
     "gymnasium": lambda: gymnasium.make_vec(
         ENV_IDS[T_INTERSECTION], num_envs=3, vectorization_mode="vector_entry_point", **TASK
     ),

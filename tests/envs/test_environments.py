@@ -14,6 +14,7 @@ from tests.simulation.scenes import LOWER
 from tint_sumo import ENV_IDS
 from tint_sumo.config import REWARD_PRESETS
 from tint_sumo.core.errors import InputError
+from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.rows import TRACKS
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.envs.scene_env import SceneEnv
@@ -83,7 +84,7 @@ def test_headways_are_those_asked_for() -> None:
     """Drivers that keep a longer headway need longer for the street."""
     shares = []
     for tau_s in (0.5, 2.5):
-        vector = SceneVectorEnv(8, tau_s=tau_s)
+        vector = SceneVectorEnv(8, TaskSettings(tau_s=tau_s))
         vector.reset(seed=0)
         for _ in range(150):
             observation, *_ = vector.step(np.zeros(8, np.int64))
@@ -104,8 +105,8 @@ def test_one_seed_gives_one_history(env: SceneEnv) -> None:
 @pytest.mark.parametrize("num_envs", [3, 10])
 def test_each_environment_of_a_batch_lives_like_a_single_one(num_envs: int) -> None:
     settings: dict[str, Any] = {"time_limit_s": 8.0, "position_noise_m": 0.1, "tracks": True}
-    vector = SceneVectorEnv(num_envs, autoreset_mode="SameStep", **settings)
-    single = SceneEnv(**settings)
+    vector = SceneVectorEnv(num_envs, TaskSettings(**settings), autoreset_mode="SameStep")
+    single = SceneEnv(TaskSettings(**settings))
     try:
         observations, infos = vector.reset(seed=20)
         observation, info = single.reset(seed=22)
@@ -155,7 +156,7 @@ def test_the_observation_is_what_the_table_says(env: SceneEnv) -> None:
 def test_infos_contain_positions_on_routes_with_tracks(env: SceneEnv) -> None:
     """The ego has passed the lower lane once its centre is beyond the border at y = 4 m, and the upper one never."""
     assert not set(TRACKS) & env.reset(seed=5)[1].keys()
-    env = SceneEnv(tracks=True, backend="traci")
+    env = SceneEnv(TaskSettings(tracks=True, backend="traci"))
     env.reset(seed=5)
     simulation, passed = env._episodes.simulation, []
     while True:
@@ -174,7 +175,10 @@ def test_infos_contain_positions_on_routes_with_tracks(env: SceneEnv) -> None:
 
 
 def test_position_noise_has_its_standard_deviation_and_spares_the_ego() -> None:
-    clear, noisy = SceneEnv(tracks=True), SceneEnv(tracks=True, position_noise_m=0.2, backend="traci")
+    clear, noisy = (
+        SceneEnv(TaskSettings(tracks=True)),
+        SceneEnv(TaskSettings(tracks=True, position_noise_m=0.2, backend="traci")),
+    )
     try:
         clear.reset(seed=1)
         noisy.reset(seed=1)
@@ -202,7 +206,7 @@ def test_position_noise_has_its_standard_deviation_and_spares_the_ego() -> None:
 
 @pytest.mark.parametrize("preset", ["paper", "authors"])
 def test_rewards_and_outcomes(preset: str) -> None:
-    env = SceneEnv(p_conservative=0.6, reward=preset, time_limit_s=15.0)
+    env = SceneEnv(TaskSettings(p_conservative=0.6, reward=preset, time_limit_s=15.0))
     numbers = REWARD_PRESETS[preset]
     outcomes = set()
     try:
@@ -234,7 +238,7 @@ def test_rewards_and_outcomes(preset: str) -> None:
 
 
 def test_the_stable_baselines3_adapter() -> None:
-    venv = VecMonitor(SceneVecEnv(4, seed=0, time_limit_s=1.0, tracks=True))
+    venv = VecMonitor(SceneVecEnv(4, TaskSettings(time_limit_s=1.0, tracks=True), seed=0))
     observation: Any = venv.reset()
     assert observation["vehicles"].shape == (4, 12, 2)
     assert len(venv.reset_infos) == 4
@@ -315,12 +319,16 @@ def test_rendering_shows_every_vehicle() -> None:
         ({"max_episode_steps": "3"}, "max_episode_steps must lie in 1 to "),
         ({"position_noise_m": "little"}, "position_noise_m must lie in 0 to 1000, not 'little'"),
         ({"tracks": "yes"}, "tracks must be True or False, not 'yes'"),
-        ({"render_mode": "ansi"}, "unknown render_mode 'ansi'; choose one of None, 'human', 'rgb_array'"),
     ],
 )
 def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        SceneEnv(**arguments)
+        SceneEnv(TaskSettings(**arguments))
+
+
+def test_bad_render_modes() -> None:
+    with pytest.raises(InputError, match="unknown render_mode 'ansi'; choose one of None, 'human', 'rgb_array'"):
+        SceneEnv(render_mode="ansi")
 
 
 def test_seeds_must_fit_the_environments() -> None:

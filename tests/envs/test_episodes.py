@@ -17,7 +17,6 @@ from tint_sumo.envs.episodes import (
     action_space,
     episode_seed,
     observation_space,
-    require_arguments,
 )
 from tint_sumo.scenes import find_scene
 from tint_sumo.scenes.geometry import NO_VEHICLE
@@ -103,16 +102,6 @@ def test_spaces_are_of_the_scene() -> None:
     assert {name: part.shape for name, part in space.items()} == {"ego": (4,), "vehicles": (5, 2), "mask": (5,)}
     limits = {name: (part.low.min(), part.high.max()) for name, part in space.items()}  # type: ignore[attr-defined]
     assert limits == {"ego": (-2.0, 2.0), "vehicles": (-2.0, 2.0), "mask": (0.0, 1.0)}
-
-
-def test_arguments_are_those_of_the_environment_and_of_the_task() -> None:
-    class Environment:
-        def __init__(self, scene: str, *, render_mode: str | None = None, **task: Any) -> None: ...
-
-    require_arguments(Environment, {"scene": "four_way", "render_mode": None, "tau_s": 1.0, "backend": "auto"})
-    for name in ("task", "self", "tau"):
-        with pytest.raises(InputError, match=name):
-            require_arguments(Environment, {name: 1.0})
 
 
 def test_episodes_have_seeds_over_the_whole_range() -> None:

@@ -11,15 +11,15 @@ import pytest
 
 from tests.envs.test_resets import assert_same_answers
 from tint_sumo.core.errors import InputError
-from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
 
 TASK: dict[str, Any] = {"position_noise_m": 0.1, "tracks": True, "time_limit_s": 0.8}
 Make = Callable[[], Any]
 KINDS: dict[str, tuple[Make, int]] = {
-    "single": (lambda: SceneEnv(**TASK), 200),
-    "traci": (lambda: SceneEnv(**TASK, backend="traci"), 10),
-    "vector": (lambda: SceneVectorEnv(3, **TASK), 200),
-    "workers": (lambda: SceneVectorEnv(3, workers=2, **TASK), 3),
+    "single": (lambda: SceneEnv(TaskSettings(**TASK)), 200),
+    "traci": (lambda: SceneEnv(TaskSettings(**TASK, backend="traci")), 10),
+    "vector": (lambda: SceneVectorEnv(3, TaskSettings(**TASK)), 200),
+    "workers": (lambda: SceneVectorEnv(3, TaskSettings(**TASK), workers=2), 3),
 }
 
 
@@ -82,5 +82,5 @@ def test_interrupts_leave_an_environment_that_can_be_reset(kind: str) -> None:
                 for one, other in zip(first_steps(env), fresh, strict=True):
                     assert_same_answers(one, other)
     assert refused or interrupts < 50  # a few interrupts may all be followed by a reset
-    with closing(SceneEnv(backend="libsumo")) as env:  # whatever was interrupted has given libsumo free
+    with closing(SceneEnv(TaskSettings(backend="libsumo"))) as env:  # whatever was interrupted has given libsumo free
         assert_same_answers(env.reset(seed=7), env.reset(seed=7))

@@ -9,7 +9,7 @@ import pytest
 
 from tests.envs.test_workers import assert_infos_equal
 from tests.scenes.networks import USER_NETWORKS, UserNetwork
-from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
 from tint_sumo.envs.episodes import Episodes
 from tint_sumo.scenes import SCENES
 
@@ -55,11 +55,11 @@ def actions(seed: int) -> Iterator[int]:
 @pytest.mark.parametrize("name", [*SCENES, *USER_NETWORKS])
 def test_nothing_of_an_episode_is_left_after_a_reset(name: str, user_network: Make) -> None:
     scene: Any = name if name in SCENES else user_network(name).scene(warm_up_s=5.0)
-    with closing(SceneEnv(scene, **TASK)) as env:
+    with closing(SceneEnv(TaskSettings(scene, **TASK))) as env:
         fresh = env.reset(seed=7)
         fresh_state, snapshot = state(env._episodes), env.snapshot()
     outcomes = set()
-    with closing(SceneEnv(scene, **TASK)) as env:
+    with closing(SceneEnv(TaskSettings(scene, **TASK))) as env:
         for seed in range(3):
             _, info = env.reset(seed=seed)
             assert info["outcome"] == ""
@@ -78,10 +78,10 @@ def test_nothing_of_an_episode_is_left_after_a_reset(name: str, user_network: Ma
 def test_nothing_of_the_episodes_of_a_vector_is_left_after_a_reset(name: str) -> None:
     """Whether they went on, had ended, were parked or reset alone."""
     task = TASK | {"time_limit_s": 8.0}
-    with closing(SceneVectorEnv(4, name, **task)) as vector:
+    with closing(SceneVectorEnv(4, TaskSettings(name, **task))) as vector:
         fresh = vector.reset(seed=7)
         fresh_state = state(vector.batch.episodes)
-    with closing(SceneVectorEnv(4, name, **task)) as vector:
+    with closing(SceneVectorEnv(4, TaskSettings(name, **task))) as vector:
         vector.reset(seed=1)
         ended = 0
         for step in range(100):
@@ -97,7 +97,7 @@ def test_nothing_of_the_episodes_of_a_vector_is_left_after_a_reset(name: str) ->
 
 
 def test_a_parked_environment_stays_so_for_as_long_as_an_episode_can_take() -> None:
-    with closing(SceneVectorEnv(2, time_limit_s=5.0)) as vector:
+    with closing(SceneVectorEnv(2, TaskSettings(time_limit_s=5.0))) as vector:
         vector.reset(seed=0)
         vector.batch.park(np.array([True, False]))
         for _ in range(200):  # the ego would be at its goal before, and the time over

@@ -1,12 +1,14 @@
 """Properties of the environments of all scenes."""
 
+from contextlib import closing
+
 import gymnasium
 import numpy as np
 import pytest
 
 from tint_sumo import ENV_IDS, SCENE_ENV_ID
 from tint_sumo.core.errors import InputError
-from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
 from tint_sumo.scenes import SCENES, find_scene
 
 GO = np.int64(2)
@@ -15,7 +17,7 @@ scenes = pytest.mark.parametrize("name", SCENES)
 
 @scenes
 def test_an_ego_on_empty_roads_reaches_its_goal(name: str) -> None:
-    env = SceneEnv(name)
+    env = SceneEnv(TaskSettings(name))
     try:
         env.reset(seed=0)
         simulation = env._episodes.simulation
@@ -32,7 +34,7 @@ def test_an_ego_on_empty_roads_reaches_its_goal(name: str) -> None:
 
 @scenes
 def test_episodes_end_in_all_ways_and_what_is_observed_stays_in_bounds(name: str) -> None:
-    env = SceneVectorEnv(24, name, p_conservative=0.5, time_limit_s=20.0)
+    env = SceneVectorEnv(24, TaskSettings(name, p_conservative=0.5, time_limit_s=20.0))
     outcomes: set[str] = set()
     try:
         observation, _ = env.reset(seed=0)
@@ -52,7 +54,7 @@ def test_episodes_end_in_all_ways_and_what_is_observed_stays_in_bounds(name: str
 
 @scenes
 def test_a_picture_shows_road_ego_and_drivers(name: str) -> None:
-    env = SceneEnv(name, render_mode="rgb_array", p_conservative=0.5)
+    env = SceneEnv(TaskSettings(name, p_conservative=0.5), render_mode="rgb_array")
     try:
         env.reset(seed=1)
         picture = env.render()
@@ -82,13 +84,13 @@ def test_any_scene_has_an_environment_without_an_id() -> None:
 def test_environments_of_several_scenes_are_those_of_each_scene() -> None:
     """Two scenes share an environment, each in another process."""
     names = ["four_way", "roundabout"]
-    both = SceneVectorEnv(4, names)
+    both = SceneVectorEnv(4, [TaskSettings(name) for name in names])
     try:
         mixed = [both.reset(seed=5)[0], *(both.step(np.full(4, 2))[0] for _ in range(60))]
     finally:
         both.close()
     for number, name in enumerate(names):
-        alone = SceneVectorEnv(2, name)
+        alone = SceneVectorEnv(2, TaskSettings(name))
         try:
             single = [alone.reset(seed=5 + 2 * number)[0], *(alone.step(np.full(2, 2))[0] for _ in range(60))]
         finally:
@@ -99,7 +101,15 @@ def test_environments_of_several_scenes_are_those_of_each_scene() -> None:
 
 
 def test_several_scenes_need_as_many_workers() -> None:
+    two = [TaskSettings("four_way"), TaskSettings("roundabout")]
     with pytest.raises(InputError, match="2 scenes need as many workers, not 3; leave workers out"):
-        SceneVectorEnv(6, ["four_way", "roundabout"], workers=3)
+        SceneVectorEnv(6, two, workers=3)
     with pytest.raises(InputError, match="the number of scenes must lie in 1 to 1, not 2"):
-        SceneVectorEnv(1, ["four_way", "roundabout"])
+        SceneVectorEnv(1, two)
+
+
+def test_gymnasium_takes_a_list_of_scenes() -> None:
+    with closing(gymnasium.make_vec(SCENE_ENV_ID, 2, scene=["four_way", "roundabout"], time_limit_s=1.0)) as vector:
+        assert isinstance(vector, SceneVectorEnv)
+        assert [one.scene.name for one in vector._settings] == ["four_way", "roundabout"]
+        assert {one.time_limit_s for one in vector._settings} == {1.0}

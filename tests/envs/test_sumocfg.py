@@ -15,18 +15,19 @@ from tests.envs.test_workers import assert_infos_equal
 from tests.scenes.networks import USER_NETWORKS, UserNetwork
 from tint_sumo import SCENE_ENV_ID
 from tint_sumo.core.errors import InputError
+from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.envs.scene_env import SceneEnv
 from tint_sumo.envs.vector import SceneVectorEnv
-from tint_sumo.scenes import T_INTERSECTION
+from tint_sumo.scenes import T_INTERSECTION, SumocfgScene
 
 Make = Callable[[str], UserNetwork]
 STEPS = 100
 
 
 @contextmanager
-def made(*args: Any, **settings: Any) -> Iterator[SceneEnv]:
-    env = SceneEnv(*args, **settings)
+def made(scene: SumocfgScene, **settings: Any) -> Iterator[SceneEnv]:
+    env = SceneEnv(TaskSettings(scene, **settings))
     try:
         yield env
     finally:
@@ -87,11 +88,11 @@ def test_the_traits_are_the_numbers_of_the_vtypes(user_network: Make) -> None:
 def test_a_vector_has_as_many_workers_as_environments(user_network: Make) -> None:
     scene = user_network("merge").scene(warm_up_s=5.0)
     with pytest.raises(InputError, match="set workers to num_envs"):
-        SceneVectorEnv(2, scene)
+        SceneVectorEnv(2, TaskSettings(scene))
     with pytest.raises(InputError, match="set workers to num_envs"):
-        SceneVectorEnv(3, scene, workers=2)
+        SceneVectorEnv(3, TaskSettings(scene), workers=2)
     rng = np.random.default_rng(0)
-    vector = SceneVectorEnv(2, scene, workers=2)
+    vector = SceneVectorEnv(2, TaskSettings(scene), workers=2)
     try:
         first, _ = vector.reset(seed=5)
         actions = rng.integers(3, size=(20, 2))
@@ -107,7 +108,7 @@ def test_a_vector_has_as_many_workers_as_environments(user_network: Make) -> Non
 
 
 def test_stable_baselines_has_them_too(user_network: Make) -> None:
-    env = SceneVecEnv(1, seed=3, scene=user_network("merge").scene(warm_up_s=5.0), tracks=True)
+    env = SceneVecEnv(1, TaskSettings(scene=user_network("merge").scene(warm_up_s=5.0), tracks=True), seed=3)
     try:
         env.reset()
         for _ in range(20):
@@ -122,7 +123,7 @@ def test_stable_baselines_has_them_too(user_network: Make) -> None:
 @pytest.mark.parametrize("settings", [{"p_conservative": 0.5}, {"tau_s": 1.5}])
 def test_the_mix_of_a_configuration_cannot_be_changed(settings: dict[str, float], user_network: Make) -> None:
     with pytest.raises(InputError, match=r"leave (p_conservative|tau_s) out"):
-        SceneEnv(user_network("merge").scene(), **settings)
+        SceneEnv(TaskSettings(user_network("merge").scene(), **settings))
 
 
 @pytest.mark.parametrize("name", [*USER_NETWORKS, T_INTERSECTION])
@@ -148,15 +149,15 @@ def test_an_episode_goes_on_from_a_snapshot_as_it_did(name: str, user_network: M
 
 @pytest.mark.parametrize("kind", ["one process", "workers", "scenes", "own network"])
 def test_the_episodes_of_a_vector_go_on_from_a_snapshot_as_they_did(kind: str, user_network: Make) -> None:
-    task: dict[str, Any] = {"position_noise_m": 0.1, "tracks": True, "time_limit_s": 12.0}
-    if kind == "own network":
-        task |= {"scene": [user_network("merge").scene(warm_up_s=5.0)] * 2}
-    task |= {
-        "workers": {"workers": 2, "autoreset_mode": "SameStep"},
-        "scenes": {"scene": ["roundabout", T_INTERSECTION]},
-    }.get(kind, {})
+    scenes: list[Any] = {
+        "own network": [user_network("merge").scene(warm_up_s=5.0)] * 2,
+        "scenes": ["roundabout", T_INTERSECTION],
+    }.get(kind, [T_INTERSECTION])
+    tasks = [TaskSettings(scene, position_noise_m=0.1, tracks=True, time_limit_s=12.0) for scene in scenes]
+    further: dict[str, Any] = {"workers": 2, "autoreset_mode": "SameStep"} if kind == "workers" else {}
+    settings = tasks[0] if kind == "workers" else tasks
     actions = np.random.default_rng(0).integers(3, size=(300, 4))
-    with closing(SceneVectorEnv(4 if kind != "own network" else 2, **task)) as vector:
+    with closing(SceneVectorEnv(4 if kind != "own network" else 2, settings, **further)) as vector:
         count = vector.num_envs
         vector.reset(seed=1)
         for action in actions[:50]:
@@ -168,7 +169,7 @@ def test_the_episodes_of_a_vector_go_on_from_a_snapshot_as_they_did(kind: str, u
         snapshots = pickle.loads(pickle.dumps(vector.snapshot()))
         went_on = [vector.step(action[:count]) for action in actions[160:]]
     assert len({len(one.actions) for one in snapshots}) > 1, "the episodes began at different times"
-    with closing(SceneVectorEnv(count, **task)) as other:
+    with closing(SceneVectorEnv(count, settings, **further)) as other:
         observation, _ = other.restore(snapshots)
         assert_infos_equal(observation, here[0])
         goes_on = [other.step(action[:count]) for action in actions[160:]]
@@ -179,7 +180,7 @@ def test_the_episodes_of_a_vector_go_on_from_a_snapshot_as_they_did(kind: str, u
 
 
 def test_there_is_nothing_to_come_back_to_before_the_first_reset() -> None:
-    with made() as env, pytest.raises(InputError, match="reset the environment first"):
+    with closing(SceneEnv()) as env, pytest.raises(InputError, match="reset the environment first"):
         env.snapshot()
     with closing(SceneVectorEnv(2)) as vector:
         with pytest.raises(InputError, match="reset the environment first"):
@@ -205,16 +206,19 @@ def test_a_snapshot_of_other_settings_is_refused(task: dict[str, Any]) -> None:
         env.reset(seed=0), vector.reset(seed=0)
         snapshot, snapshots = env.snapshot(), vector.snapshot()
     with (
-        closing(SceneEnv(**task)) as env,
+        closing(SceneEnv(TaskSettings(**task))) as env,
         pytest.raises(InputError, match="is of another scene or other"),
     ):
         env.restore(snapshot)
-    with closing(SceneVectorEnv(2, **task)) as vector, pytest.raises(InputError, match="is of another scene or other"):
+    with (
+        closing(SceneVectorEnv(2, TaskSettings(**task))) as vector,
+        pytest.raises(InputError, match="is of another scene or other"),
+    ):
         vector.restore(snapshots)
 
 
 def test_settings_that_leave_an_episode_as_it_is_may_differ() -> None:
-    with closing(SceneEnv(reward="authors", tracks=True)) as env:
+    with closing(SceneEnv(TaskSettings(reward="authors", tracks=True))) as env:
         env.reset(seed=0)
         env.step(np.int64(2))
         snapshot = env.snapshot()
@@ -223,7 +227,7 @@ def test_settings_that_leave_an_episode_as_it_is_may_differ() -> None:
 
 
 def test_each_environment_of_a_vector_has_the_snapshots_of_its_scene() -> None:
-    with closing(SceneVectorEnv(2, scene=["four_way", T_INTERSECTION])) as vector:
+    with closing(SceneVectorEnv(2, [TaskSettings("four_way"), TaskSettings()])) as vector:
         vector.reset(seed=0)
         first, second = vector.snapshot()
         with pytest.raises(InputError, match="is of another scene or other settings"):

@@ -13,7 +13,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from tests.envs.test_workers import assert_infos_equal
 from tint_sumo import ENV_IDS
 from tint_sumo.core.errors import InputError
-from tint_sumo.envs import SceneEnv, SceneVectorEnv
+from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.scenes import T_INTERSECTION
@@ -58,7 +58,7 @@ def test_each_mode_is_as_gymnasiums(mode: AutoresetMode, task: dict[str, Any], s
     """Observations, rewards, ends and infos with their masks, field by field."""
     task = TASK | task
     ours = gymnasium.make_vec(ENV_ID, num_envs=3, autoreset_mode=mode.value, **task)
-    theirs = SyncVectorEnv([lambda: SceneEnv(backend="traci", **task)] * 3, autoreset_mode=mode)
+    theirs = SyncVectorEnv([lambda: SceneEnv(TaskSettings(backend="traci", **task))] * 3, autoreset_mode=mode)
     assert isinstance(ours, SceneVectorEnv)
     assert ours.metadata["autoreset_mode"] is mode
     assert ours.observation_space == theirs.observation_space
@@ -74,7 +74,7 @@ def test_each_mode_is_as_gymnasiums(mode: AutoresetMode, task: dict[str, Any], s
 
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_statistics_of_episodes_are_sums_over_their_steps(mode: AutoresetMode) -> None:
-    env = RecordEpisodeStatistics(SceneVectorEnv(3, autoreset_mode=mode, **TASK))
+    env = RecordEpisodeStatistics(SceneVectorEnv(3, TaskSettings(**TASK), autoreset_mode=mode))
     lengths, returns = np.zeros(3, int), np.zeros(3)
     recorded = 0
     was_over = np.zeros(3, bool)
@@ -101,13 +101,13 @@ def test_statistics_of_episodes_are_sums_over_their_steps(mode: AutoresetMode) -
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_a_snapshot_may_be_taken_where_an_episode_has_ended(mode: AutoresetMode) -> None:
     """Within a decision, so that the other environments have gone on."""
-    task = TASK | {"autoreset_mode": mode, "decision_s": 0.7}
+    task = TaskSettings(**TASK, decision_s=0.7)
 
     def go_on(env: SceneVectorEnv, over: Any) -> list[Any]:
         returned: list[Any] = [env.reset(options={"reset_mask": over})] if mode is AutoresetMode.DISABLED else []
         return [*returned, *(env.step(np.full(4, GO)) for _ in range(3))]
 
-    with closing(SceneVectorEnv(4, **task)) as env:
+    with closing(SceneVectorEnv(4, task, autoreset_mode=mode)) as env:
         env.reset(seed=3)
         over = np.zeros(4, bool)
         while not over.any():
@@ -116,7 +116,7 @@ def test_a_snapshot_may_be_taken_where_an_episode_has_ended(mode: AutoresetMode)
         assert not over.all()
         snapshots = env.snapshot()
         went_on = go_on(env, over)
-    with closing(SceneVectorEnv(4, **task)) as other:
+    with closing(SceneVectorEnv(4, task, autoreset_mode=mode)) as other:
         assert_infos_equal(other.restore(snapshots)[0], observation)
         for before, after in zip(went_on, go_on(other, over), strict=True):
             for first, second in zip(before, after, strict=True):
@@ -124,7 +124,7 @@ def test_a_snapshot_may_be_taken_where_an_episode_has_ended(mode: AutoresetMode)
 
 
 def test_without_autoreset_ended_episodes_take_no_step() -> None:
-    with closing(SceneVectorEnv(2, autoreset_mode="Disabled", time_limit_s=0.2)) as env:
+    with closing(SceneVectorEnv(2, TaskSettings(time_limit_s=0.2), autoreset_mode="Disabled")) as env:
         env.reset(seed=0)
         env.step(np.array([GO, GO]))
         env.step(np.array([GO, GO]))
@@ -145,7 +145,7 @@ def test_an_unknown_mode_is_refused() -> None:
 @pytest.mark.parametrize("outcome", OUTCOMES)
 def test_only_an_episode_that_a_collision_ended_has_its_details(outcome: str) -> None:
     """An ego whose episode has ended otherwise may still be hit while others go on in the same decision."""
-    with closing(SceneVectorEnv(1, time_limit_s=1.0)) as env:
+    with closing(SceneVectorEnv(1, TaskSettings(time_limit_s=1.0))) as env:
         env.reset(seed=0)
         assert isinstance(env.batch, LocalBatch)
         episodes = env.batch.episodes

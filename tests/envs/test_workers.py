@@ -17,6 +17,7 @@ import pytest
 
 from tests.envs.test_environments import ENV_ID, assert_equal
 from tint_sumo.core.errors import InputError
+from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.envs.vector import SceneVectorEnv
 
@@ -49,10 +50,9 @@ def wait_until_ended(process_ids: list[int]) -> None:
 
 @pytest.mark.parametrize(("workers", "mode"), [(2, "SameStep"), (3, "NextStep")])
 def test_results_do_not_depend_on_the_number_of_workers(workers: int, mode: str) -> None:
-    settings: dict[str, Any] = {"time_limit_s": 6.0, "position_noise_m": 0.1, "p_conservative": 0.6, "tracks": True}
-    settings["autoreset_mode"] = mode
-    one = SceneVectorEnv(5, **settings)
-    many = SceneVectorEnv(5, **settings, workers=workers)
+    task = TaskSettings(time_limit_s=6.0, position_noise_m=0.1, p_conservative=0.6, tracks=True)
+    one = SceneVectorEnv(5, task, autoreset_mode=mode)
+    many = SceneVectorEnv(5, task, workers=workers, autoreset_mode=mode)
     try:
         assert_equal(one.reset(seed=7)[0], many.reset(seed=7)[0])
         rng = np.random.default_rng(0)
@@ -87,7 +87,10 @@ def assert_infos_equal(first: Any, second: Any) -> None:
 
 
 def test_the_stable_baselines3_adapter_takes_workers() -> None:
-    one, two = SceneVecEnv(4, seed=3, time_limit_s=2.0), SceneVecEnv(4, seed=3, time_limit_s=2.0, workers=2)
+    one, two = (
+        SceneVecEnv(4, TaskSettings(time_limit_s=2.0), seed=3),
+        SceneVecEnv(4, TaskSettings(time_limit_s=2.0), seed=3, workers=2),
+    )
     try:
         assert_equal(one.reset(), two.reset())
         kept: Any = None

@@ -28,6 +28,7 @@ from tint_sumo.core.errors import InputError, JobError
 from tint_sumo.core.stores import Store
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.schema import MANIFEST
+from tint_sumo.envs import TaskSettings
 from tint_sumo.jobs import Executor, Local
 from tint_sumo.jobs.process import log_path
 from tint_sumo.methods.evaluation import evaluate
@@ -427,9 +428,9 @@ def test_a_share_of_a_gpu() -> None:
 
 
 def test_an_evaluation_is_the_same_case_by_case(cluster: Executor) -> None:
-    contender, world = load_policy("oracle"), {"p_conservative": 0.4}
-    alone = evaluate(contender.policy, lambda count: contender.make_venv(count, **world), 150, 3)
-    assert evaluate_on(cluster, "oracle", contender, world, 150, 3, progress=False) == alone
+    contender, task = load_policy("oracle"), TaskSettings(p_conservative=0.4)
+    alone = evaluate(contender.policy, lambda count: contender.make_venv(count, task), 150, 3)
+    assert evaluate_on(cluster, "oracle", task, 150, 3, progress=False) == alone
 
 
 def test_shards_go_to_a_store_from_where_they_are_recorded(cluster: Executor, two_shards: Path, tmp_path: Path) -> None:

@@ -8,11 +8,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from tint_sumo.config import STEP_S
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Progress
+from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.methods.evaluation import CASE_SEED, Case, Evaluation, case_seed, evaluate, require_cases
 from tint_sumo.methods.rules import AlwaysGo, TimeToCollision
 
-make_venv = partial(SceneVecEnv, p_conservative=0.6, time_limit_s=12.0)
+make_venv = partial(SceneVecEnv, settings=TaskSettings(p_conservative=0.6, time_limit_s=12.0))
 
 
 @pytest.mark.parametrize("policy", [AlwaysGo(), TimeToCollision(0.5)])
@@ -94,7 +95,9 @@ def test_the_environment_is_closed_and_progress_told() -> None:
         return made[-1]
 
     found = evaluate(AlwaysGo(), make, 5, 0, batch=4, report=told.append)
-    evaluate(AlwaysGo(), partial(make_venv, backend="libsumo"), 1, 0)  # refused if libsumo were still busy
+    evaluate(
+        AlwaysGo(), partial(SceneVecEnv, settings=TaskSettings(backend="libsumo")), 1, 0
+    )  # refused if libsumo were still busy
     assert [venv.num_envs for venv in made] == [4]
     assert [(one.done, one.total, one.unit) for one in told] == [(done, 5, "case") for done in range(1, 6)]
     assert all(set(one.measures) == {"success", "collision"} for one in told)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from tests.simulation.scenes import LOWER
+from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.evaluation import evaluate
 from tint_sumo.methods.rules import CREEP, GO, STOP, AlwaysGo, Observation, TimeToCollision
 from tint_sumo.policy.wrappers import policy_venv
-from tint_sumo.scenes import SCENES
+from tint_sumo.scenes import SCENES, find_scene
 
 LOWER_Y_M, UPPER_Y_M = 2.0, 6.0
 AT_LINE_Y_M = -2.6  # of the ego's centre: its front is at y = -0.1, past the line where it waits, at -0.5
@@ -124,12 +125,13 @@ def test_environments_of_a_batch_do_not_mix() -> None:
 @pytest.mark.parametrize("centre_m", [(2.0, LOWER_Y_M), (-0.1, LOWER_Y_M), (0.0, UPPER_Y_M), (2.1, UPPER_Y_M)])
 def test_in_the_mirrored_scene_it_acts_alike(centre_m: tuple[float, float]) -> None:
     seen, mirrored = scene(centre_m), scene((-centre_m[0], centre_m[1]))
-    assert act(mirrored, mirrored, TimeToCollision(scene="t_intersection_right")) == act(seen, seen)
+    assert act(mirrored, mirrored, TimeToCollision(scene=find_scene("t_intersection_right"))) == act(seen, seen)
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_it_gets_through_where_there_is_room_in_every_scene(name: str) -> None:
     """Also where it ends among the traffic: it waits for nobody once it is in their path."""
-    rule = TimeToCollision(scene=name)
-    found = evaluate(rule, lambda num_envs: policy_venv(num_envs, None, scene=name, p_conservative=1.0), 12, 0)
+    rule = TimeToCollision(scene=find_scene(name))
+    task = TaskSettings(name, p_conservative=1.0)
+    found = evaluate(rule, lambda num_envs: policy_venv(num_envs, None, [task]), 12, 0)
     assert found.rate("success").value > 0.15

@@ -28,6 +28,7 @@ from tint_sumo.core.checkpoints import CHECKPOINT_FILE, PICKLES
 from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import DivergedError, InputError
 from tint_sumo.core.progress import Progress, Report
+from tint_sumo.envs import TaskSettings
 from tint_sumo.films.training_films import film_policy
 from tint_sumo.methods.evaluation import CASE_SEED, evaluate
 from tint_sumo.methods.loading import load_policy
@@ -74,7 +75,7 @@ def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
 
 def observed(source_of: Path, num_envs: int = 16) -> Any:
     """What a trained policy sees at the beginning of some episodes."""
-    venv = load_policy(source_of).make_venv(num_envs, p_conservative=0.4)
+    venv = load_policy(source_of).make_venv(num_envs, TaskSettings(p_conservative=0.4))
     venv.seed(7)
     observation = venv.reset()
     venv.close()
@@ -170,7 +171,7 @@ def test_a_loaded_policy_acts_as_the_trained_one(
 def test_decisions_can_last_several_steps(tmp_path: Path, tiny: PpoSettings) -> None:
     train_policy("oracle", Mix(0.4), 64, 0, tmp_path, settings=replace(tiny, action_repeat=5))
     contender = load_policy(tmp_path)
-    venv = contender.make_venv(2, p_conservative=0.4)
+    venv = contender.make_venv(2, TaskSettings(contender.scene, p_conservative=0.4))
     venv.seed(0)
     start_y_m = 20.0 * venv.reset()["ego"][:, 1]
     y_m = 20.0 * venv.step(np.array([2, 2]))[0]["ego"][:, 1]
@@ -501,7 +502,12 @@ def test_the_trait_model_travels_with_the_policy(tmp_path: Path, tiny: PpoSettin
         contender = load_policy(path)
         assert contender.source is not None
         assert isinstance(contender.source(), EncoderTraits)
-    found = evaluate(contender.policy, lambda num_envs: contender.make_venv(num_envs, p_conservative=1.0), 2, 0)
+    found = evaluate(
+        contender.policy,
+        lambda num_envs: contender.make_venv(num_envs, TaskSettings(contender.scene, p_conservative=1.0)),
+        2,
+        0,
+    )
     assert len(found.cases) == 2
 
 
@@ -551,7 +557,12 @@ def test_a_critic_that_sees_true_traits_is_trained_and_the_policy_drives_without
     contender = load_policy(tmp_path)
     assert contender.source is not None and isinstance(contender.source(), StreamingTraits)
     assert set(observed(tmp_path)) == {"ego", "vehicles", "mask", "traits"}
-    found = evaluate(contender.policy, lambda num_envs: contender.make_venv(num_envs, p_conservative=0.9), 2, 0)
+    found = evaluate(
+        contender.policy,
+        lambda num_envs: contender.make_venv(num_envs, TaskSettings(contender.scene, p_conservative=0.9)),
+        2,
+        0,
+    )
     assert len(found.cases) == 2
 
 

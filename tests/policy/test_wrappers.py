@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tint_sumo.core.errors import InputError
+from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy import ActionRepeat, OracleTraits
 from tint_sumo.policy.wrappers import policy_venv
@@ -12,7 +13,7 @@ GO, STOP = 2, 0
 
 
 def test_a_decision_is_so_many_steps_and_the_sum_of_their_rewards() -> None:
-    plain, repeated = SceneVecEnv(3, seed=0), ActionRepeat(SceneVecEnv(3, seed=0, backend="traci"), 4)
+    plain, repeated = SceneVecEnv(3, seed=0), ActionRepeat(SceneVecEnv(3, TaskSettings(backend="traci"), seed=0), 4)
     plain.reset()
     repeated.reset()
     for action in (GO, STOP, GO):
@@ -29,7 +30,7 @@ def test_a_decision_is_so_many_steps_and_the_sum_of_their_rewards() -> None:
 
 
 def test_an_episode_ends_the_decision_and_the_next_one_waits() -> None:
-    venv = ActionRepeat(SceneVecEnv(2, seed=0, time_limit_s=0.6), 4)
+    venv = ActionRepeat(SceneVecEnv(2, TaskSettings(time_limit_s=0.6), seed=0), 4)
     venv.reset()
     assert not venv.step(np.full(2, GO))[2].any()
     observation, rewards, done, infos = venv.step(np.full(2, GO))
@@ -53,7 +54,8 @@ def test_at_least_one_step() -> None:
 def test_every_step_is_shown_until_an_episode_s_very_end() -> None:
     """What is shown at the end is the end itself, not the beginning of the next episode."""
     shown: list[tuple[Any, Any]] = []
-    venv = policy_venv(2, OracleTraits(), action_repeat=4, on_step=lambda *step: shown.append(step), time_limit_s=0.6)
+    task = TaskSettings(time_limit_s=0.6)
+    venv = policy_venv(2, OracleTraits(), [task], action_repeat=4, on_step=lambda *step: shown.append(step))
     venv.seed(0)
     first = venv.reset()
     venv.step(np.array([2, 0]))

@@ -15,8 +15,8 @@ from tint_sumo.scenes import (
     SCENES,
     Scene,
     described,
-    digest_of,
     find_scene,
+    find_scenes,
     read_described,
     read_scene,
     scene_settings,
@@ -40,9 +40,10 @@ def changed(**settings: Any) -> Scene:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_with_unchanged_numbers_is_the_built_in_one(name: str) -> None:
-    assert read_scene({"base": name}) == name
-    assert read_scene(plain(scene_settings(name))) == name
-    assert read_described(described(name)) == name
+    scene = find_scene(name)
+    assert read_scene({"base": name}) == read_scene(name) == scene
+    assert read_scene(plain(scene_settings(scene))) == scene
+    assert read_described(described([scene])) == (scene,)
 
 
 def test_what_is_not_said_is_as_in_the_base() -> None:
@@ -72,16 +73,16 @@ def test_a_changed_scene_has_another_name() -> None:
     ],
 )
 def test_the_digest_differs_with_roads_and_tasks(settings: dict[str, Any], differs: bool) -> None:
-    assert (changed(**settings).digest != digest_of("four_way")) == differs
+    assert (changed(**settings).digest != find_scene("four_way").digest) == differs
 
 
 def test_a_card_contains_all_settings_of_a_changed_scene() -> None:
     scene = changed(arrivals_per_s=0.2, population=[SHY, {**SHY, "name": "bold", "yields": False}], step_s=0.05)
-    card = described(scene)
+    card = described([scene])
     assert (card["scene"], card["scene_digest"]) == (scene.name, scene.digest)
-    assert read_described(card) == scene
-    assert set(described("four_way")) == {"scene", "scene_digest"}
-    assert read_described(described(ALL_SCENES)) == ALL_SCENES
+    assert read_described(card) == (scene,)
+    assert set(described([find_scene("four_way")])) == {"scene", "scene_digest"}
+    assert read_described(described(find_scenes(ALL_SCENES))) == find_scenes(ALL_SCENES)
 
 
 def test_a_sumo_configuration(user_network: Callable[[str], UserNetwork]) -> None:
@@ -89,7 +90,7 @@ def test_a_sumo_configuration(user_network: Callable[[str], UserNetwork]) -> Non
     task = {"ego_route": list(merge.ego_route), "start_m": 20, "goal_m": 130, "warm_up_s": 20}
     scene = read_scene({"sumocfg": str(merge.sumocfg), **task})
     assert scene == merge.scene()
-    assert read_described(described(scene)) == scene
+    assert read_described(described([scene])) == (scene,)
     with pytest.raises(InputError, match=r"scene: the ego's start \(20 m\) and goal \(900 m\) must lie on its route"):
         read_scene({"sumocfg": str(merge.sumocfg), **task, "goal_m": 900}, ("scene",))
 

@@ -13,8 +13,10 @@ from tint_sumo.config import (
     TraitSettings,
 )
 from tint_sumo.core.structures import plain
+from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.registry import Learned, find_method
 from tint_sumo.methods.training import SNAPSHOTS_PERCENT
+from tint_sumo.scenes import find_scene
 from tint_sumo.study.budgets import BUDGETS, Conditions
 
 
@@ -90,8 +92,9 @@ def test_conditions_are_called_by_what_differs_from_the_training(conditions: Con
 
 def test_a_headway_that_is_not_given_is_the_scene_s() -> None:
     own, given = Conditions(Mix(0.4)), Conditions(Mix(0.4), tau_s=Idm.tau_s)
-    assert "tau_s" not in own.world
-    assert given.world["tau_s"] == Idm.tau_s
+    scene = find_scene("t_intersection")
+    assert own.task(scene) == TaskSettings(p_conservative=0.4)
+    assert given.task(scene) == TaskSettings(p_conservative=0.4, tau_s=Idm.tau_s)
     assert own.resolved(1.5).tau_s == 1.5
     assert given.resolved(1.5) == given.relative_to(1.5) == given
     assert given.relative_to(Idm.tau_s) == own.relative_to(Idm.tau_s) == own

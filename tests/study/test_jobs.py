@@ -10,6 +10,7 @@ from tint_sumo.config import ALL_MIXES, Idm, Mix, PpoSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
 from tint_sumo.core.progress import Progress, silent
+from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.evaluation import CASES, evaluate
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.registry import METHODS
@@ -118,7 +119,9 @@ def test_a_rule_is_tested_on_the_same_cases_as_everyone_but_not_after_parts_of_a
         (other, 3),
     ]
     rule = load_policy("always_go")
-    found = evaluate(rule.policy, lambda num_envs: rule.make_venv(num_envs, p_conservative=0.4), 4, CASES)
+    found = evaluate(
+        rule.policy, lambda num_envs: rule.make_venv(num_envs, TaskSettings(rule.scene, p_conservative=0.4)), 4, CASES
+    )
     assert result.tested[0].evaluation == found
 
 

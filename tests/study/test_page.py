@@ -17,6 +17,7 @@ from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
 from tint_sumo.core.progress import silent
+from tint_sumo.envs import TaskSettings
 from tint_sumo.films.driving import Driven, Moment, drive_case
 from tint_sumo.films.trait_probe import TraitReader
 from tint_sumo.methods.evaluation import Case, Evaluation
@@ -159,7 +160,7 @@ def test_recordings_tell_the_case_and_are_made_once_for_a_policy_and_its_cases(t
     assert job.run(silent) == "policies: 1"
     episodes = read_episodes(recording.file)
     assert list(episodes) == [2, 0]
-    driven = drive_case(load_policy("always_go"), 2, 0, p_conservative=0.4)
+    driven = drive_case(load_policy("always_go"), 2, 0, TaskSettings(p_conservative=0.4))
     assert (episodes[2]["outcome"], episodes[2]["time_s"]) == (driven.case.outcome, driven.case.time_s)
     x_m = [moment.ego["x_m"] for moment in driven.moments]
     assert decoded("x_m", episodes[2]["ego"]["x_m"]) == pytest.approx(x_m, abs=0.006)
@@ -183,7 +184,7 @@ def test_damaged_recordings_are_named_in_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(SCENES))
 def test_the_roads_of_every_scene_lie_in_its_picture(name: str) -> None:
-    shapes, roads = scene_shapes(name), layout(find_scene(name))
+    shapes, roads = scene_shapes(find_scene(name)), layout(find_scene(name))
     left, top, width, height = shapes["view"]
     points = np.array(
         [[float(part) for part in pair.split()] for pair in re.findall(r"-?[\d.]+ -?[\d.]+", shapes["way"])]

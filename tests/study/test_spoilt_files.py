@@ -20,7 +20,7 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.schema import read_manifest
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.policy.storage import read_versions
-from tint_sumo.scenes import described
+from tint_sumo.scenes import described, find_scene
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE, read_ceilings
 from tint_sumo.study.folders import RESULTS
@@ -105,7 +105,7 @@ def test_results_of_trait_studies(kind: str, tmp_path: Path, monkeypatch: pytest
 
 
 def test_settings_of_runs(tmp_path: Path) -> None:
-    settings = {"kind": "study", **described("roundabout"), "budget": "quick", "numbers": [1, {"a": 2}]}
+    settings = {"kind": "study", **described([find_scene("roundabout")]), "budget": "quick", "numbers": [1, {"a": 2}]}
     out = tmp_path / "run"
 
     def read() -> None:

@@ -28,6 +28,7 @@ from tint_sumo.config import PPO_BUDGETS, TRAIT_BUDGETS, WINDOW_STEPS, PpoSettin
 from tint_sumo.core.determinism import single_threaded
 from tint_sumo.core.progress import Progress
 from tint_sumo.dataset.windows import Windows
+from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.jobs.table import one_job
@@ -180,7 +181,7 @@ class _Driven:
     """A Stable-Baselines3 environment with random actions."""
 
     def __init__(self, sizes: Sizes, workers: int = 1, seed: int = 0, scene: str = T_INTERSECTION) -> None:
-        self.env = SceneVecEnv(sizes.replicas, seed=seed, workers=workers, scene=scene)
+        self.env = SceneVecEnv(sizes.replicas, TaskSettings(find_scene(scene)), seed, workers=workers)
         self._actions = np.random.default_rng(0).integers(3, size=(sizes.turn_steps, sizes.replicas))
         self.env.reset()
         for _ in range(_WARM_UP_STEPS):

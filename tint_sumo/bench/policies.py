@@ -16,10 +16,12 @@ from tint_sumo import traits
 from tint_sumo.bench.measuring import Clocks, Turn, turns_apart
 from tint_sumo.config import ALL_MIXES, PpoSettings
 from tint_sumo.core.determinism import single_threaded
+from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.methods.registry import find_learned
 from tint_sumo.methods.training import new_model, training_venv
 from tint_sumo.policy import ActionRepeat, GruPolicy, StreamingTraits, TraitObservation
+from tint_sumo.scenes import paper_scene
 
 INSTALL_SB3_CONTRIB = "sb3-contrib is not installed: pip install sb3-contrib"
 DECISION_METHOD = (
@@ -52,7 +54,7 @@ def training_speed(settings: PpoSettings, turns: int) -> dict[str, float | None]
 @contextmanager
 def _training(make: MakeModel, settings: PpoSettings) -> Iterator[Turn]:
     """Give turns that measure the decisions per second of one more rollout with its updates, as in the study."""
-    venv = training_venv(find_learned("no_labels"), None, ALL_MIXES, settings)
+    venv = training_venv(find_learned("no_labels"), None, ALL_MIXES, settings, [paper_scene()])
     with closing(venv), single_threaded():
         model = make(venv, 0, settings)
         model.set_logger(Logger(None, []))
@@ -84,7 +86,7 @@ def _contrib_model(venv: VecEnv, seed: int, settings: PpoSettings) -> OnPolicyAl
 
 def decision_ms(settings: PpoSettings, decisions: int) -> float:
     """Return the median time of a decision (``DECISION_METHOD``) with streaming traits and the study's network."""
-    env = SceneVecEnv(1, seed=0, tracks=True)
+    env = SceneVecEnv(1, TaskSettings(tracks=True), seed=0)
     observed = TraitObservation(env, StreamingTraits(traits.load("cross_window")))
     with closing(ActionRepeat(observed, settings.action_repeat)) as venv, single_threaded():
         policy = GruPolicy(venv.observation_space, venv.action_space, lambda _: 0.0, settings=settings.policy)

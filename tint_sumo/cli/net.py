@@ -20,10 +20,10 @@ class Net(Command):
     """Folder for the files; files of the same names are replaced if this command wrote them."""
 
     def run(self) -> Outcome:
-        from tint_sumo.scenes import require_built_in
+        from tint_sumo.scenes import find_scene, require_built_in
         from tint_sumo.scenes.build import CONFIG_FILE, write_scene
 
-        scene = require_built_in("a network", self.scene)
+        scene = require_built_in("a network", find_scene(self.scene))
         files = write_scene(self.out, scene, self.replicas)
         text = f"wrote {len(files)} files to {self.out}; run them with: sumo -c {self.out / CONFIG_FILE}"
         return Outcome(text, {"replicas": self.replicas, "files": [str(file) for file in files]})

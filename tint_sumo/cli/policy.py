@@ -1,6 +1,6 @@
 """``tint-sumo policy``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -31,6 +31,7 @@ from tint_sumo.core.structures import Many, plain
 from tint_sumo.methods.registry import learned_methods
 
 if TYPE_CHECKING:
+    from tint_sumo.envs import TaskSettings
     from tint_sumo.methods.loading import Contender
 
 _LEARNED = ", ".join(learned_methods())
@@ -79,11 +80,11 @@ class TrainPolicy(Command):
         from tint_sumo.films.training_films import film_policy
         from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.training import train_policy
-        from tint_sumo.scenes import ALL_SCENES, find_scene
+        from tint_sumo.scenes import find_scenes
 
         use_one_thread()
         is_given = self.p_conservative != TrainPolicy.p_conservative
-        has_mix = is_given or self.scene == ALL_SCENES or find_scene(self.scene).sumocfg is None
+        has_mix = is_given or find_scenes(self.scene)[0].sumocfg is None
         settings = PPO_BUDGET.full(self.budget)
         steps = settings.total_steps if self.steps is None else self.steps
         mix = Mix.parse(self.p_conservative) if has_mix else None
@@ -131,21 +132,22 @@ class EvaluatePolicy(SpreadCommand):
         from tint_sumo.methods.loading import load_policy
 
         use_one_thread()
-        given = {"scene": self.scene, "allow_pickle": self.allow_pickle}
-        contender = load_policy(self.model, **given)
-        world = world_of(contender, self.p_conservative, self.noise, self.tau)
+        contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
+        task = task_of(contender, self.p_conservative, self.noise, self.tau)
         with self.workers_of(1) as workers:
             if isinstance(workers, int):
                 with one_job(f"evaluate {self.model}") as report:
                     evaluation = evaluate(
                         contender.policy,
-                        lambda num_envs: contender.make_venv(num_envs, **world),
+                        lambda num_envs: contender.make_venv(num_envs, task),
                         self.episodes,
                         self.seed,
                         report=report,
                     )
             else:
-                evaluation = evaluate_on(workers, self.model, contender, world, self.episodes, self.seed, **given)
+                evaluation = evaluate_on(
+                    workers, self.model, task, self.episodes, self.seed, allow_pickle=self.allow_pickle
+                )
         rates = {outcome: evaluation.rate(outcome) for outcome in OUTCOMES}
         lines = [
             f"{outcome:9} {percent(rate.value):>5}%  (95 % interval {low}% to {high}%)"
@@ -154,8 +156,8 @@ class EvaluatePolicy(SpreadCommand):
         ]
         time_s = evaluation.navigation_time_s
         lines.append("no success" if time_s is None else f"navigation time {time_s:.1f} s")
-        place = {"model": self.model, "scene": contender.scene_name, **plain(world)}
-        return Outcome("\n".join(lines), {**place, "seed": self.seed, **evaluation.summary()})
+        content = {"model": self.model, **content_of(task), "seed": self.seed, **evaluation.summary()}
+        return Outcome("\n".join(lines), content)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,6 +184,7 @@ class SweepPolicy(SpreadCommand):
 
     def run(self) -> Outcome:
         from tint_sumo.comparisons.sweep import Sweep, read_varied, report_markdown, run_sweep
+        from tint_sumo.scenes import find_scene
 
         sweep = Sweep(
             PPO_BUDGET.full(self.budget),
@@ -189,7 +192,7 @@ class SweepPolicy(SpreadCommand):
             methods=self.methods,
             seeds=self.seeds,
             p_conservative=Mix.parse(self.p_conservative),
-            scene=self.scene,
+            scene=find_scene(self.scene),
             episodes=self.episodes,
         )
         with working_folder(self.out) as out, self.workers_of(self.workers, self.gpus_per_job) as workers:
@@ -211,12 +214,19 @@ class Policy:
     )
 
 
-def world_of(
+def task_of(
     contender: "Contender", p_conservative: MixFlag | None, noise_m: float, tau_s: float | None
-) -> dict[str, Any]:
-    """Return the traffic for an evaluation; values that are not given are those of the policy's training."""
+) -> "TaskSettings":
+    """Return the settings of the environments that flags ask for; what is not given is as in the policy's training."""
+    mix = contender.p_conservative if p_conservative is None else Mix.parse(p_conservative)
+    return replace(contender.task, p_conservative=mix, position_noise_m=noise_m, tau_s=tau_s)
+
+
+def content_of(task: "TaskSettings") -> dict[str, Any]:
+    """Return what --json prints of settings of environments."""
     return {
-        "p_conservative": contender.p_conservative if p_conservative is None else Mix.parse(p_conservative),
-        "position_noise_m": noise_m,
-        "tau_s": contender.tau_s if tau_s is None else tau_s,
+        "scene": task.scene.name,
+        "p_conservative": plain(task.p_conservative),
+        "position_noise_m": task.position_noise_m,
+        "tau_s": task.played.tau_s,
     }

@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import Annotated
 
 from tint_sumo.cli.command import Command, Outcome, use_one_thread
-from tint_sumo.cli.policy import world_of
+from tint_sumo.cli.policy import content_of, task_of
 from tint_sumo.cli.values import PolicyName, TestMix, TestScene, TestTau
 from tint_sumo.config import NoiseM, Seed
 from tint_sumo.core.ranges import Range
-from tint_sumo.core.structures import plain
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,15 +38,9 @@ class Render(Command):
         require_film_file(self.out)
         use_one_thread()
         contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
-        world = world_of(contender, self.p_conservative, self.noise, self.tau)
+        task = task_of(contender, self.p_conservative, self.noise, self.tau)
         with one_job(f"render {self.out}") as report:
-            film = render_case(contender, self.case, self.out, seed=self.seed, report=report, **world)
+            film = render_case(contender, self.case, self.out, seed=self.seed, task=task, report=report)
         text = f"{film.outcome} after {film.time_s:.1f} s, {film.frames} frames: {self.out}"
-        content = {
-            "model": self.model,
-            "scene": contender.scene_name,
-            **plain(world),
-            "case": self.case,
-            "seed": self.seed,
-        }
+        content = {"model": self.model, **content_of(task), "case": self.case, "seed": self.seed}
         return Outcome(text, {**content, "out": str(self.out), **asdict(film)})

@@ -23,15 +23,18 @@ SCENES = ", ".join(ENV_IDS)
 
 
 def _read_scene(value: Any, where: Where = ()) -> Any:
-    from tint_sumo.scenes import ALL_SCENES, read_scene
+    from tint_sumo.scenes import ALL_SCENES, find_scenes, read_scene
 
-    return value if value in (None, ALL_SCENES) else read_scene(value, where)
+    if value in (None, ALL_SCENES):
+        return value
+    scene = read_scene(value, where)
+    return scene.name if scene in find_scenes(ALL_SCENES) else scene
 
 
 def _scene_in_full(value: Any) -> Any:
-    from tint_sumo.scenes import ALL_SCENES, scene_settings
+    from tint_sumo.scenes import ALL_SCENES, find_scene, scene_settings
 
-    return value if value in (None, ALL_SCENES) else scene_settings(value)
+    return value if value in (None, ALL_SCENES) else scene_settings(find_scene(value))
 
 
 def _read_population(value: Any, where: Where) -> Any:

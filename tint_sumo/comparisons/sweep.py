@@ -1,7 +1,7 @@
 """Other settings of PPO: every combination of some values is trained and tested, and one table compares them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import product
 from operator import attrgetter
@@ -27,7 +27,7 @@ from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.jobs import Workers, executor_of
 from tint_sumo.methods.evaluation import TUNING_CASES, require_cases, require_seed
 from tint_sumo.methods.registry import METHODS, Learned, find_learned, with_shared_trainings
-from tint_sumo.scenes import T_INTERSECTION, Scene, described, digest_of
+from tint_sumo.scenes import T_INTERSECTION, Scene, described, paper_scene
 from tint_sumo.study.budgets import Conditions, Trials
 from tint_sumo.study.jobs import EvaluateJob, TrainJob
 from tint_sumo.study.plan import require_scene
@@ -52,7 +52,7 @@ class Sweep:
     methods: tuple[str, ...] = ("oracle",)
     seeds: tuple[int, ...] = (0,)
     p_conservative: Mix = ALL_MIXES  # in training
-    scene: str | Scene = T_INTERSECTION
+    scene: Scene = field(default_factory=paper_scene)
     episodes: int = 500  # cases at each P(conservative)
 
     def __post_init__(self) -> None:
@@ -142,7 +142,7 @@ def run_sweep(sweep: Sweep, out: Path, *, workers: Workers = 2, progress: bool =
         JobError: jobs were given up; all others are done.
     """
     executor = executor_of(workers)
-    with claim_folder(out, {"kind": "sweep", **plain(sweep), **described(sweep.scene)}):
+    with claim_folder(out, {"kind": "sweep", **plain(sweep), **described([sweep.scene])}):
         executor.run(plan(sweep, out), progress)
         table = _read_table(_tests(sweep, out))
         write_text(out / "sweep.csv", table.to_csv(index=False))
@@ -268,7 +268,7 @@ def _with_spread(shares: "pd.Series[float]") -> str:
 def _require_traits(methods: Sequence[Learned], scene: Scene) -> None:
     """Raise InputError unless there are trait models for these methods in this scene."""
     inferring = [method.name for method in methods if method.encoder]
-    if inferring and scene.digest != digest_of(T_INTERSECTION):
+    if inferring and scene.digest != paper_scene().digest:
         others = [one.name for one in METHODS.values() if isinstance(one, Learned) and not one.encoder]
         raise InputError(
             f"{', '.join(inferring)}: the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; "

@@ -1,7 +1,7 @@
 """Record the traffic without the ego (paper III-B) to Parquet, shard by shard."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,7 +14,7 @@ from tint_sumo.core.structures import plain
 from tint_sumo.dataset.schema import SCHEMA_VERSION, Manifest
 from tint_sumo.dataset.shards import EPISODE_STEPS, record_dataset, require_sizes
 from tint_sumo.jobs import Workers
-from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
+from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene, paper_scene
 from tint_sumo.scenes.geometry import Floats, Numbers
 from tint_sumo.simulation.scene import SceneSimulation
 
@@ -29,7 +29,7 @@ class Recording:
     p_conservative: Mix
     population: Population | None = None  # the scene's if not given
     seed: int = 0
-    scene: str | Scene = T_INTERSECTION
+    scene: Scene = field(default_factory=paper_scene)
 
     episodes_per_shard: ClassVar[int] = EPISODES_PER_SHARD
 
@@ -38,7 +38,7 @@ class Recording:
         self.played()
 
     def played(self) -> Scene:
-        scene = find_scene(self.scene)
+        scene = self.scene
         traffic = replace(scene.traffic, p_conservative=self.p_conservative)
         return replace(scene, traffic=traffic, population=self.population or scene.population)
 
@@ -47,7 +47,7 @@ class Recording:
         return {
             "kind": "dataset",
             "schema_version": SCHEMA_VERSION,
-            **described(played),
+            **described([played]),
             "windows": self.windows,
             "p_conservative": self.p_conservative.plain(),
             "population": population_name(played.population) or plain(played.population),
@@ -84,7 +84,7 @@ def record(
         InputError: bad values, or ``out`` holds another run.
     """
     drivers = find_population(population) if isinstance(population, str) else population
-    recording = Recording(windows, Mix.parse(p_conservative), drivers, seed, scene)
+    recording = Recording(windows, Mix.parse(p_conservative), drivers, seed, find_scene(scene))
     try:
         return record_dataset(
             out,

@@ -2,10 +2,8 @@
 
 import hashlib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -25,7 +23,6 @@ from tint_sumo.config import (
 )
 from tint_sumo.core.errors import InputError, shown
 from tint_sumo.core.ranges import require_ranges
-from tint_sumo.core.structures import require_fields
 from tint_sumo.envs.rows import (
     BOUND,
     COLLISION,
@@ -40,7 +37,7 @@ from tint_sumo.envs.rows import (
     observe_tracks,
     row_type,
 )
-from tint_sumo.scenes import T_INTERSECTION, Scene, SumocfgScene, find_scene
+from tint_sumo.scenes import AnyScene, find_scene, paper_scene
 from tint_sumo.scenes.geometry import NO_VEHICLE, Floats
 from tint_sumo.simulation import make_simulation
 from tint_sumo.simulation.timing import StepPart, does
@@ -51,13 +48,16 @@ _STEP_TOLERANCE = 1e-6  # of decision_s in steps, for numbers such as 0.3 / 0.1
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """The arguments of all environments; ``tint_sumo.envs.scene_env.SceneEnv`` explains them.
+    """Settings of an episode; ``tint_sumo.envs.scene_env.SceneEnv`` explains them.
+
+    They are made once, by the user or by a command, and passed on as they are. A built-in scene's name for ``scene``,
+    and one number or two for ``p_conservative``, are taken here, too, and nowhere below.
 
     Raises:
         InputError: a value makes no sense.
     """
 
-    scene: str | Scene | SumocfgScene = T_INTERSECTION
+    scene: AnyScene = field(default_factory=paper_scene)
     p_conservative: Mix | None = None
     reward: str = "paper"
     time_limit_s: TimeS | None = None
@@ -69,6 +69,7 @@ class TaskSettings:
     backend: Backend = "auto"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "scene", find_scene(self.scene))
         if self.p_conservative is not None:
             object.__setattr__(self, "p_conservative", Mix.parse(self.p_conservative))
         if self.reward not in REWARD_PRESETS:
@@ -87,7 +88,7 @@ class TaskSettings:
 
     @property
     def _step_s(self) -> float:
-        return find_scene(self.scene).step_s
+        return self.scene.step_s
 
     @property
     def _decision_s(self) -> float:
@@ -115,31 +116,16 @@ class TaskSettings:
         return ("traits", *TRACKS) if self.tracks else ("traits",)
 
     @cached_property
-    def played(self) -> Scene | SumocfgScene:
+    def played(self) -> AnyScene:
         """The scene with these settings."""
-        scene = find_scene(self.scene).with_drivers(self.p_conservative, self.tau_s)
+        scene = self.scene.with_drivers(self.p_conservative, self.tau_s)
         limit_s = scene.time_limit_s if self.time_limit_s is None else self.time_limit_s
         if self.max_episode_steps is not None:
             limit_s = min(limit_s, self.max_episode_steps * self.steps_per_decision * scene.step_s)
         return replace(scene, time_limit_s=limit_s)
 
 
-def require_arguments(environment: type, task: Mapping[str, Any]) -> None:
-    """Raise InputError if an environment class has no such arguments.
-
-    Args:
-        environment: a class whose further arguments are those of ``TaskSettings``.
-        task: the further arguments.
-    """
-    named = [
-        parameter.name
-        for parameter in signature(environment).parameters.values()
-        if parameter.kind is not parameter.VAR_KEYWORD
-    ]
-    require_fields(task, dict.fromkeys([*named, *(field.name for field in fields(TaskSettings))]))
-
-
-def action_space(scene: Scene | SumocfgScene) -> spaces.Discrete:
+def action_space(scene: AnyScene) -> spaces.Discrete:
     return spaces.Discrete(len(scene.ego.controller.desired_speeds_mps))
 
 

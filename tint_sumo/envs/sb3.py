@@ -11,17 +11,16 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.calls import checked_seed
-from tint_sumo.envs.episodes import require_arguments
+from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import end_info, fields_of, observation_of
 from tint_sumo.envs.vector import SceneVectorEnv
-from tint_sumo.scenes import T_INTERSECTION, AnyScene
 from tint_sumo.simulation.timing import StepPart, does
 
 
 class SceneVecEnv(VecEnv):
     """Stable-Baselines3 ``VecEnv`` of ``num_envs`` replicas of a scene in one simulation.
 
-    Takes the arguments of ``tint_sumo.envs.scene_env.SceneEnv``, and ``workers`` as ``SceneVectorEnv`` does.
+    ``settings`` and ``workers`` are as in ``SceneVectorEnv``.
     ``infos[i]`` holds ``traits``, the true traits that go with the returned observation; when an episode ends also
     ``terminal_observation``, ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``is_success``, ``time_s`` and,
     after a collision, ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then; without
@@ -36,16 +35,14 @@ class SceneVecEnv(VecEnv):
     def __init__(
         self,
         num_envs: int,
+        settings: TaskSettings | Sequence[TaskSettings] | None = None,
         seed: int | None = None,
-        scene: AnyScene | Sequence[AnyScene] = T_INTERSECTION,
         render_mode: str | None = None,
         workers: int | None = None,
         autoreset: bool = True,
-        **task: Any,
     ) -> None:
-        require_arguments(SceneVecEnv, task)
         mode = AutoresetMode.SAME_STEP if autoreset else AutoresetMode.DISABLED
-        self.env = SceneVectorEnv(num_envs, scene, render_mode, workers, mode, **task)
+        self.env = SceneVectorEnv(num_envs, settings, render_mode, workers, mode)
         super().__init__(num_envs, self.env.single_observation_space, self.env.single_action_space)
         self._actions: NDArray[np.int64] = np.zeros(num_envs, np.int64)
         if seed is not None:

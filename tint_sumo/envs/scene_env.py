@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Snapshot, checked_snapshots
 from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_options, checked_seed
-from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space, require_arguments
+from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, Observation, fields_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
-from tint_sumo.scenes import T_INTERSECTION, Scene, SumocfgScene
 from tint_sumo.simulation import Simulation
 
 
@@ -81,6 +80,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `collision`    | after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`                 |
 
     ## Arguments
+    `gymnasium.make` takes all of these as keyword arguments. The class itself takes `render_mode`, and all others as a
+    `tint_sumo.envs.TaskSettings`: `SceneEnv(TaskSettings("on_ramp", p_conservative=0.4), render_mode="human")`.
+
     * `scene`: name of a scene, a `tint_sumo.scenes.Scene`, or what `tint_sumo.scenes.from_sumocfg` makes of a SUMO
       configuration of your own. Then the traffic is the configuration's, several lanes and changes between them
       included; `ego` is seen from where it starts, with the network's axes; `vehicles` are the nearest in sight;
@@ -124,13 +126,10 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012 - gymnasium's way
 
-    def __init__(
-        self, scene: str | Scene | SumocfgScene = T_INTERSECTION, render_mode: str | None = None, **task: Any
-    ) -> None:
+    def __init__(self, settings: TaskSettings | None = None, render_mode: str | None = None) -> None:
         require_render_mode(render_mode, self.metadata["render_modes"])
-        require_arguments(SceneEnv, task)
         self.render_mode = render_mode
-        settings = TaskSettings(scene, **task)
+        settings = settings or TaskSettings()
         fps = render_fps(settings.decision_s)
         modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}  # what is possible here

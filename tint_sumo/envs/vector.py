@@ -23,7 +23,7 @@ from tint_sumo.envs.calls import (
     checked_options,
     checked_seeds,
 )
-from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space, require_arguments
+from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
 from tint_sumo.envs.rows import (
     GOING_ON,
@@ -37,7 +37,6 @@ from tint_sumo.envs.rows import (
     step_info,
 )
 from tint_sumo.envs.workers import WorkerBatch, shares_of
-from tint_sumo.scenes import T_INTERSECTION, AnyScene
 
 MOST_ENVS = 100_000  # environments of one vector; memory would not do for more
 
@@ -55,8 +54,8 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     last observation and info stand in ``infos["final_obs"]`` and ``infos["final_info"]``. With ``"Disabled"`` it begins
     with ``reset(options={"reset_mask": mask})``, whose mask (N,) is true for the environments to reset.
 
-    ``scene`` may also be a list of scenes: the environments are shared out among them, in order and as evenly as can
-    be, and each scene has a process of its own.
+    ``settings`` may also be several, as for several scenes: the environments are shared out among them, in order and as
+    evenly as can be, and each has a process for itself. ``gymnasium.make_vec`` takes a list of scenes instead.
 
     With ``workers`` above 1 the environments are shared out among as many processes, with the same results; a script
     that asks for them needs the usual ``if __name__ == "__main__":``. This process is one of them, unless another
@@ -73,38 +72,33 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def __init__(
         self,
         num_envs: int = 1,
-        scene: AnyScene | Sequence[AnyScene] = T_INTERSECTION,
+        settings: TaskSettings | Sequence[TaskSettings] | None = None,
         render_mode: str | None = None,
         workers: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        **task: Any,
     ) -> None:
         num_envs = checked_count("num_envs", num_envs, MOST_ENVS)
-        if isinstance(scene, str) or not isinstance(scene, Sequence):
+        if settings is None or isinstance(settings, TaskSettings):
             count = 1 if workers is None else checked_count("workers", workers, num_envs)
-            scenes: Sequence[AnyScene] = [scene] * count
-        elif workers in (None, len(scene)):
-            scenes = scene
-        else:
-            raise InputError(f"{len(scene)} scenes need as many workers, not {workers}; leave workers out")
-        checked_count("the number of scenes", len(scenes), num_envs)
+            settings = [settings or TaskSettings()] * count
+        elif workers not in (None, len(settings)):
+            raise InputError(f"{len(settings)} scenes need as many workers, not {workers}; leave workers out")
+        checked_count("the number of scenes", len(settings), num_envs)
         require_render_mode(render_mode, self.metadata["render_modes"])
-        require_arguments(SceneVectorEnv, task)
-        all_settings = [TaskSettings(found, **task) for found in scenes]
-        settings = all_settings[0]
-        if len({settings.played.max_vehicles for settings in all_settings}) > 1:
+        first = settings[0]
+        if len({task.played.max_vehicles for task in settings}) > 1:
             raise InputError("scenes of one environment must observe the same number of vehicles; change max_vehicles")
         self._mode = _autoreset_mode(autoreset_mode)
-        fps = render_fps(settings.decision_s)
+        fps = render_fps(first.decision_s)
         self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
         self.num_envs = num_envs
-        self.slot_infos = settings.slot_infos
+        self.slot_infos = first.slot_infos
         self.render_mode = render_mode
-        self.single_observation_space = observation_space(settings.played.max_vehicles)
-        self.single_action_space: spaces.Discrete = action_space(settings.played)
+        self.single_observation_space = observation_space(first.played.max_vehicles)
+        self.single_action_space: spaces.Discrete = action_space(first.played)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._settings = all_settings
+        self._settings = list(settings)
         self._calls = Calls()
         self.batch = self._make_batch()
 

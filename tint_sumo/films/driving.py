@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.batch import LocalBatch
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.methods.evaluation import Case, evaluate
@@ -51,19 +52,19 @@ class Driven:
     moments: tuple[Moment, ...]
 
 
-def drive_case(contender: Contender, case: int, seed: int, **task: Any) -> Driven:
+def drive_case(contender: Contender, case: int, seed: int, task: TaskSettings) -> Driven:
     """Evaluate a policy on case ``case`` of the set ``seed``, and keep every step of the simulation.
 
     Args:
         contender: the policy.
         case: number of the case, as in ``tint_sumo.methods.evaluation.evaluate``.
         seed: which set of cases.
-        task: as in ``SceneEnv``.
+        task: settings of the environment.
     """
     recorder = _Recorder(contender)
 
     def make_venv(num_envs: int) -> VecEnv:
-        venv = contender.make_venv(num_envs, on_step=recorder.record, **task)
+        venv = contender.make_venv(num_envs, task, on_step=recorder.record)
         recorder.attach(venv)
         return venv
 

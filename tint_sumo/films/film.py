@@ -5,15 +5,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageColor
 
-from tint_sumo.config import AnyMix, Mix
+from tint_sumo.config import Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import require_output_file, whole_file
 from tint_sumo.core.progress import Progress, Report, silent
+from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.rendering import RENDER_FPS
 from tint_sumo.films.driving import Moment, drive_case
 from tint_sumo.films.frames import SIZE_PX, Artist
@@ -21,7 +21,7 @@ from tint_sumo.films.trait_probe import fit_reader
 from tint_sumo.methods.evaluation import CASES_PER_SEED, require_seed
 from tint_sumo.methods.loading import Contender
 from tint_sumo.methods.registry import look_of
-from tint_sumo.scenes import Scene, require_built_in
+from tint_sumo.scenes import AnyScene, Scene, require_built_in
 from tint_sumo.scenes.layout import layout
 
 SUFFIXES = (".mp4", ".gif", ".png")
@@ -44,9 +44,8 @@ def render_case(
     out: Path,
     *,
     seed: int = 0,
-    p_conservative: AnyMix | None = None,
+    task: TaskSettings | None = None,
     report: Report = silent,
-    **task: Any,
 ) -> Film:
     """Drive one unseen case and write what happened: a film, or for .png a strip of its moments.
 
@@ -57,9 +56,8 @@ def render_case(
         case: number of the case, as in ``tint_sumo.methods.evaluation.evaluate``.
         out: .mp4, .gif or .png file.
         seed: which set of cases, 0 to 1000.
-        p_conservative: as in ``SceneEnv``; that of the contender if not given.
+        task: settings of the environment; those of the contender if not given.
         report: called with the progress.
-        task: as in ``SceneEnv``; the scene is the contender's.
 
     Raises:
         InputError: there is no such case, or no such kind of film, or what writes it is not installed.
@@ -68,11 +66,11 @@ def render_case(
     require_seed(seed)
     if not 0 <= case < CASES_PER_SEED:
         raise InputError(f"case must lie in 0 to {CASES_PER_SEED - 1}, not {case}")
-    mix = contender.p_conservative if p_conservative is None else Mix.parse(p_conservative)
-    played = require_film_scene(contender)
-    driven = drive_case(contender, case, seed, p_conservative=mix, **task)
+    task = task or contender.task
+    played = require_film_scene(task.scene)
+    driven = drive_case(contender, case, seed, task)
     shown = _spread(driven.moments) if out.suffix.lower() == ".png" else driven.moments
-    parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(mix))
+    parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(task.p_conservative))
     has_attention = driven.moments[0].attention is not None
     colour = ImageColor.getrgb(look_of(contender.method).colour)
     artist = Artist(layout(played), (" " * 5).join(parts), colour, fit_reader(contender), has_attention)
@@ -81,9 +79,9 @@ def render_case(
     return Film(driven.case.outcome, driven.case.time_s, len(shown))
 
 
-def require_film_scene(contender: Contender) -> Scene:
-    """Return the contender's scene; InputError unless a film can show it."""
-    return require_built_in("a film", contender.scene, profiles=2)
+def require_film_scene(scene: AnyScene) -> Scene:
+    """Return a scene; InputError unless a film can show it."""
+    return require_built_in("a film", scene, profiles=2)
 
 
 def require_film_file(out: Path) -> None:

@@ -20,7 +20,7 @@ def film_policy(policy: Path) -> bytes | None:
     trained_in = read_policy_card(policy.with_suffix("")).get("scene")
     contender = load_policy(policy, scene=T_INTERSECTION if trained_in == ALL_SCENES else None)
     try:
-        require_film_scene(contender)
+        require_film_scene(contender.scene)
     except InputError:
         return None
     with tempfile.TemporaryDirectory() as folder:

@@ -6,14 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from sklearn.linear_model import LogisticRegression
 
-from tint_sumo.config import CONSERVATIVE_LABEL, LATENT_SIZE
+from tint_sumo.config import CONSERVATIVE_LABEL, LATENT_SIZE, Mix
+from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.loading import Contender
 from tint_sumo.policy.trait_sources import StreamingTraits
 from tint_sumo.scenes.geometry import Floats
 
 _ENVS, _STEPS = 8, 200  # environments and steps of the observed traffic
 _EVERY = 5  # steps: neighbouring ones say the same
-_P_CONSERVATIVE = 0.5
+_MIX = Mix(0.5)
 _WAIT = 0  # action of the ego in that traffic
 _PROBIT = math.pi / 8  # how the uncertainty of an input flattens a logistic function (MacKay 1992)
 
@@ -57,7 +58,7 @@ def fit_reader(contender: Contender) -> TraitReader | None:
 
 def _look_at_traffic(contender: Contender) -> tuple[Floats, Floats]:
     """Return observed traits of M drivers (M, Z), and their true traits (M,)."""
-    venv = replace(contender, action_repeat=1).make_venv(_ENVS, p_conservative=_P_CONSERVATIVE)
+    venv = replace(contender, action_repeat=1).make_venv(_ENVS, TaskSettings(contender.scene, _MIX))
     observed, traits = [], []
     try:
         venv.seed(0)

@@ -3,10 +3,8 @@
 import math
 import shutil
 import tempfile
-from collections.abc import Mapping
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -14,11 +12,11 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_record, write_json
 from tint_sumo.core.progress import Report
 from tint_sumo.core.reading import RESULT_BYTES
+from tint_sumo.envs import TaskSettings
 from tint_sumo.jobs import Executor
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
 from tint_sumo.methods.evaluation import BATCH, Case, Evaluation, StoredCase, evaluate, require_cases
-from tint_sumo.methods.loading import Contender, load_policy
-from tint_sumo.scenes import AnyScene, find_scene
+from tint_sumo.methods.loading import load_policy
 
 MAX_CASES = 1000  # cases of a job: some 20 seconds' work is lost with a machine
 _MODEL = "model"  # folder of the policy's files
@@ -37,9 +35,8 @@ class CasesJob:
     """Evaluate a policy on the cases ``first``, ``first + 1``, ... of a set of cases."""
 
     model: str  # a name, or a path in ``out``
-    scene: AnyScene | None  # as in ``load_policy``
     allow_pickle: bool
-    world: Mapping[str, Any]  # what the environments are told
+    task: TaskSettings
     seed: int  # which set of cases
     first: int
     episodes: int
@@ -67,12 +64,11 @@ class CasesJob:
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
         placed = self.out / self.model
-        contender = load_policy(
-            placed if placed.exists() else self.model, scene=self.scene, allow_pickle=self.allow_pickle
-        )
+        model = placed if placed.exists() else self.model
+        contender = load_policy(model, scene=self.task.scene, allow_pickle=self.allow_pickle)
         evaluation = evaluate(
             contender.policy,
-            lambda num_envs: contender.make_venv(num_envs, **self.world),
+            lambda num_envs: contender.make_venv(num_envs, self.task),
             self.episodes,
             self.seed,
             first=self.first,
@@ -89,12 +85,10 @@ class CasesJob:
 def evaluate_on(
     executor: Executor,
     model: str,
-    contender: Contender,
-    world: Mapping[str, Any],
+    task: TaskSettings,
     episodes: int,
     seed: int,
     *,
-    scene: AnyScene | None = None,
     allow_pickle: bool = False,
     progress: bool = True,
 ) -> Evaluation:
@@ -102,9 +96,8 @@ def evaluate_on(
 
     Args:
         executor: where it is done.
-        model, scene, allow_pickle: what ``load_policy`` was given.
-        contender: what it has made of that.
-        world: what the environments are told.
+        model, allow_pickle: as in ``load_policy``.
+        task: settings of the environments.
         episodes, seed: number of cases, and which set of cases.
         progress: show a table on stderr.
 
@@ -113,7 +106,7 @@ def evaluate_on(
         JobError: cases were given up.
     """
     require_cases(episodes, seed)
-    if find_scene(contender.scene).sumocfg:
+    if task.scene.sumocfg:
         raise InputError("the .sumocfg of a scene is on this machine alone; evaluate here, not on a cluster")
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as folder:
         out = Path(folder)
@@ -121,7 +114,7 @@ def evaluate_on(
         rounds = math.ceil(episodes / (MAX_CASES * executor.slots))  # each gives every slot a job of the same size
         count = BATCH * math.ceil(episodes / (rounds * executor.slots * BATCH))
         jobs = [
-            CasesJob(named, scene, allow_pickle, world, seed, first, min(count, episodes - first), out)
+            CasesJob(named, allow_pickle, task, seed, first, min(count, episodes - first), out)
             for first in range(0, episodes, count)
         ]
         executor.run(jobs, progress)

@@ -7,27 +7,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits
 from tint_sumo.config import LATENT_SIZE, Mix, Traffic
 from tint_sumo.core.determinism import preserved_random_state
-from tint_sumo.core.errors import InputError, NotFiniteError
+from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
+from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.registry import METHODS, Learned, Policy, Rule, find_learned
 from tint_sumo.methods.rules import ACTIONS as RULE_ACTIONS
 from tint_sumo.methods.training import POLICY, TRAITS, digest
-from tint_sumo.policy import GruPolicy, RecurrentPPO, TraitSource
+from tint_sumo.policy import RecurrentPPO, TraitSource
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
 from tint_sumo.policy.wrappers import OnStep, policy_venv
-from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, find_scene, read_described
+from tint_sumo.scenes import ALL_SCENES, SCENES, AnyScene, find_scene, paper_scene, read_described
 from tint_sumo.traits import TraitModel
-
-_PROBES = 16  # observations for which a policy's outputs must be finite
-_FAR = 10.0  # end of the range of traits, which have no bounds
 
 
 @dataclass(frozen=True)
@@ -36,34 +31,31 @@ class Contender:
 
     name: str
     policy: Policy
+    scene: AnyScene  # what it drives in
     source: Callable[[], TraitSource] | None = None  # source of the traits in its observations; None: it has no traits
     p_conservative: Mix | None = Traffic.p_conservative  # what it was trained for; None in a SUMO configuration
     action_repeat: int = 1  # simulation steps per decision
-    scene: AnyScene = T_INTERSECTION  # what it was trained in
     method: str = ""  # name of the method in the registry
 
     @property
-    def scene_name(self) -> str:
-        return self.scene if isinstance(self.scene, str) else self.scene.name
+    def task(self) -> TaskSettings:
+        """Settings of the environments that it is for; ``dataclasses.replace`` makes others of them."""
+        return TaskSettings(self.scene, self.p_conservative)
 
-    @property
-    def tau_s(self) -> float | None:
-        """Time headway of the scene's drivers; None in a SUMO configuration."""
-        return find_scene(self.scene).tau_s
+    def make_venv(self, num_envs: int, task: TaskSettings, *, on_step: OnStep | None = None) -> VecEnv:
+        """Return environments with the observations that the policy takes.
 
-    def make_venv(self, num_envs: int, *, on_step: OnStep | None = None, **task: Any) -> VecEnv:
-        """Return environments with the observations that the policy takes; ``task`` as in ``SceneEnv``.
-
-        In a SUMO configuration each has a process of its own, and there are no more than the machine has cores.
+        In a SUMO configuration each has a process for itself, and there are no more than the machine has cores.
         ``on_step`` is as in ``tint_sumo.policy.wrappers.policy_venv``.
         """
         source = None if self.source is None else self.source()
-        place = task.get("scene", self.scene)
-        count = min(num_envs, os.cpu_count() or 1) if find_scene(place).sumocfg else num_envs
-        return policy_venv(count, source, action_repeat=self.action_repeat, on_step=on_step, **{"scene": place, **task})
+        count = min(num_envs, os.cpu_count() or 1) if task.scene.sumocfg else num_envs
+        return policy_venv(count, source, [task], action_repeat=self.action_repeat, on_step=on_step)
 
 
-def load_policy(name_or_path: str | Path, *, scene: AnyScene | None = None, allow_pickle: bool = False) -> Contender:
+def load_policy(
+    name_or_path: str | Path, *, scene: str | AnyScene | None = None, allow_pickle: bool = False
+) -> Contender:
     """A hand-written rule or a shipped policy by its name, or a trained one by its folder or file.
 
     The card, a .json file beside the weights, names the method and the trait model.
@@ -76,12 +68,12 @@ def load_policy(name_or_path: str | Path, *, scene: AnyScene | None = None, allo
 
     Raises:
         InputError: there is no such policy, or its files are missing, damaged or not to be read.
-        NotFiniteError: its outputs are not finite.
     """
+    given = None if scene is None else find_scene(scene)
     method = METHODS.get(str(name_or_path))
     if isinstance(method, Rule):
-        place = scene or T_INTERSECTION
-        return _in_scene(Contender(method.name, method.make(place), method=method.name), place)
+        place = given or paper_scene()
+        return _in_scene(Contender(method.name, method.make(place), place, method=method.name), place)
     if Path(name_or_path).suffix == ".zip":
         stem = Path(name_or_path).with_suffix("")
         found = _contender(stem, _load_zip(Path(name_or_path), allow_pickle))
@@ -89,41 +81,40 @@ def load_policy(name_or_path: str | Path, *, scene: AnyScene | None = None, allo
         stem = find_policy(name_or_path)
         found = _contender(stem, load_policy_network(stem))
     found = replace(found, name=str(name_or_path))
-    if scene is None:
-        if found.scene == ALL_SCENES:
-            raise InputError(f"{name_or_path} was trained in all scenes; give the `scene`")
-        _require_same_roads(stem, found)
-        return found
-    return _in_scene(found, scene)
+    if given is not None:
+        return _in_scene(found, given)
+    if len(read_described(read_policy_card(stem))) > 1:
+        raise InputError(f"{name_or_path} was trained in all scenes; give the `scene`")
+    _require_same_roads(stem, found)
+    return found
 
 
 def _in_scene(contender: Contender, scene: AnyScene) -> Contender:
-    """The policy in another scene.
+    """Return the policy for another scene.
 
     Raises:
-        InputError: there is no such scene, or it has other numbers of observed vehicles or of actions.
+        InputError: the scene has other numbers of observed vehicles or of actions.
     """
-    found = find_scene(scene)
     network: Any = contender.policy
     is_rule = contender.source is None
-    vehicles = found.max_vehicles if is_rule else network.observation_space["vehicles"].shape[0]
+    vehicles = scene.max_vehicles if is_rule else network.observation_space["vehicles"].shape[0]
     actions = RULE_ACTIONS if is_rule else network.action_space.n
     for what, wanted, there in (
-        ("max_vehicles", vehicles, found.max_vehicles),
-        ("desired_speeds_mps", actions, len(found.ego.controller.desired_speeds_mps)),
+        ("max_vehicles", vehicles, scene.max_vehicles),
+        ("desired_speeds_mps", actions, len(scene.ego.controller.desired_speeds_mps)),
     ):
         if wanted != there:
-            raise InputError(f"policy {contender.name} needs {what} of {wanted}, and scene {found.name} has {there}")
+            raise InputError(f"policy {contender.name} needs {what} of {wanted}, and scene {scene.name} has {there}")
     trained_for = Traffic.p_conservative if contender.p_conservative is None else contender.p_conservative
-    return replace(contender, scene=scene, p_conservative=None if found.sumocfg else trained_for)
+    return replace(contender, scene=scene, p_conservative=None if scene.sumocfg else trained_for)
 
 
 def _require_same_roads(stem: Path, found: Contender) -> None:
     """Raise InputError if a policy was trained in another version of its scene."""
-    if read_policy_card(stem).get("scene_digest") != find_scene(found.scene).digest:
-        scene = "its name" if isinstance(found.scene, str) else "its definition"
+    if read_policy_card(stem).get("scene_digest") != found.scene.digest:
+        scene = "its name" if found.scene.name in SCENES else "its definition"
         raise InputError(
-            f"{card_file(stem)}: this policy was trained in another version of the scene {found.scene_name}; "
+            f"{card_file(stem)}: this policy was trained in another version of the scene {found.scene.name}; "
             f"give {scene} as `scene` to use it all the same"
         )
 
@@ -139,45 +130,19 @@ def _load_zip(file: Path, allow_pickle: bool) -> RecurrentPPO:
         return RecurrentPPO.load(file)
 
 
-def _contender(stem: Path, policy: GruPolicy | RecurrentPPO) -> Contender:
+def _contender(stem: Path, policy: Any) -> Contender:
     card = _checked_card(stem)
-    _require_finite(stem, policy if isinstance(policy, GruPolicy) else policy.policy)
     learned = find_learned(card["method"])
     encoder = None if learned.encoder is None else _load_encoder(stem, card)
     return Contender(
         stem.name,
         policy,
+        read_described(card)[0],
         lambda: learned.make_source(encoder),
         None if card["p_conservative"] is None else Mix.parse(card["p_conservative"]),
         int(card["settings"]["action_repeat"]),
-        read_described(card),
         learned.name,
     )
-
-
-@torch.no_grad()
-def _require_finite(stem: Path, policy: GruPolicy) -> None:
-    """Raise NotFiniteError if finite weights give outputs that are not, for observations at the ends of their ranges.
-
-    A training with too high a learning rate can end with such weights.
-    """
-    assert isinstance(policy.observation_space, spaces.Dict)
-    rng = np.random.default_rng(0)
-    limits = {key: np.minimum(part.high, _FAR) for key, part in policy.observation_space.spaces.items()}  # type: ignore[attr-defined]
-    policy.set_training_mode(False)
-    try:
-        for count in (1,) * _PROBES + (_PROBES,):  # whether sums overflow depends on the size of the batch, too
-            drawn = {key: rng.choice([-1.0, 1.0], (count, *limit.shape)) * limit for key, limit in limits.items()}
-            tensors, _ = policy.obs_to_tensor({key: array.astype(np.float32) for key, array in drawn.items()})
-            starts = torch.ones(count, device=policy.device)
-            _, values, _, _ = policy(tensors, policy.initial_states(count), starts, deterministic=True)
-            if not values.isfinite().all():
-                raise FloatingPointError
-    except FloatingPointError:
-        raise NotFiniteError(
-            f"{weights_file(stem)}: the policy's outputs are not finite, since its weights are too large; "
-            "train it again with a lower learning_rate"
-        ) from None
 
 
 def _load_encoder(stem: Path, card: dict[str, Any]) -> TraitModel:

@@ -1,13 +1,13 @@
 """Hand-written policies. They see what a learned policy sees, the observation, and never ``info``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.config import POSITION_SCALE_M, SPEED_SCALE_MPS
-from tint_sumo.scenes import T_INTERSECTION, AnyScene, require_built_in
+from tint_sumo.scenes import AnyScene, paper_scene, require_built_in
 from tint_sumo.scenes.geometry import SPACING_M, Floats, along, as_line, new_boxes, place, project
 from tint_sumo.scenes.layout import Layout, layout
 
@@ -53,7 +53,7 @@ class TimeToCollision:
     threshold_s: float = 1.2
     zone_margin_m: float = 1.0  # the zone begins this far before the ego's path
     line_margin_m: float = 0.5  # the ego waits this far before a route's lane
-    scene: AnyScene = T_INTERSECTION
+    scene: AnyScene = field(default_factory=paper_scene)
 
     @cached_property
     def _world(self) -> "_World":

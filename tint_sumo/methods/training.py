@@ -5,7 +5,7 @@ import hashlib
 import io
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from tint_sumo.core.files import claim_folder, write_text
 from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.core.provenance import versions
 from tint_sumo.core.training_log import log_film, open_log
+from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.methods.checkpoint import make_checkpoint, restore_checkpoint
 from tint_sumo.methods.evaluation import CASE_SEED, require_seed
@@ -33,7 +34,7 @@ from tint_sumo.methods.registry import Learned, find_learned
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
 from tint_sumo.policy.wrappers import policy_venv
-from tint_sumo.scenes import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, described, find_scene
+from tint_sumo.scenes import T_INTERSECTION, AnyScene, described, find_scenes
 from tint_sumo.scenes.drivers import require_two_kinds
 from tint_sumo.traits import TraitModel
 from tint_sumo.traits.storage import read_card, require_scene, save
@@ -61,7 +62,7 @@ def train_policy(
     out: Path,
     *,
     settings: PpoSettings,
-    scene: AnyScene = T_INTERSECTION,
+    scene: str | AnyScene = T_INTERSECTION,
     traits: str | Path | None = None,
     other_scene: bool = False,
     with_zip: bool = False,
@@ -100,14 +101,15 @@ def train_policy(
         DivergedError: a loss or a weight is not finite; the checkpoint is of before that.
     """
     learned = find_learned(method)
-    _require_drivers(learned, p_conservative, scene)
+    scenes = find_scenes(scene)
+    _require_drivers(learned, p_conservative, scenes[0])
     require_seed(seed)
     if steps < 1:
         raise InputError(f"steps must be at least 1, not {steps}")
     if learned.encoder is None and (traits is not None or other_scene):
         raise InputError(f"method {method} infers no traits; leave the trait model and other_scene out")
     encoder = _load_encoder(learned, traits)
-    place = described(scene)
+    place = described(scenes)
     if encoder is not None and not other_scene:
         require_scene(traits or str(learned.encoder), place["scene"], place["scene_digest"], "the policy")
     settings = learned.settings_of(settings)
@@ -132,7 +134,7 @@ def train_policy(
             if encoder is not None:
                 save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)).entries)
             card = _card(identity, encoder)
-            venv = training_venv(learned, encoder, p_conservative, settings, scene)
+            venv = training_venv(learned, encoder, p_conservative, settings, scenes)
             try:
                 with preserved_random_state(), single_threaded():
                     model = _learn(venv, steps, seed, out, settings, card, film, report)
@@ -170,11 +172,9 @@ def share_training(source: Path, method: str, out: Path, traits: str | Path | No
 
 def _require_drivers(learned: Learned, p_conservative: Mix | None, scene: AnyScene) -> None:
     """Raise InputError unless a method can be trained among a scene's drivers, in such a mix."""
-    played = T_INTERSECTION if scene == ALL_SCENES else scene
-    found = find_scene(played)
-    kinds = len(found.with_drivers(p_conservative, None).traits)
+    kinds = len(scene.with_drivers(p_conservative, None).traits)
     if learned.sees_true_traits:
-        require_two_kinds(kinds, learned.name, f"scene {found.name}")
+        require_two_kinds(kinds, learned.name, f"scene {scene.name}")
 
 
 def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | None:
@@ -190,20 +190,18 @@ def training_venv(
     encoder: TraitModel | None,
     p_conservative: Mix | None,
     settings: PpoSettings,
-    scene: AnyScene = T_INTERSECTION,
+    scenes: Sequence[AnyScene],
 ) -> VecEnv:
     """Environments with the traits that the method is trained with."""
-    played = [find_scene(one) for one in (SCENES if scene == ALL_SCENES else [scene])]
+    time_limit_s = min(settings.time_limit_s, *(one.time_limit_s for one in scenes))
     shown = learned if learned.trained_as is None else find_learned(learned.trained_as)
     return policy_venv(
         settings.n_envs,
         shown.make_source(encoder if shown.encoder else None),
+        [TaskSettings(one, p_conservative, time_limit_s=time_limit_s) for one in scenes],
         action_repeat=settings.action_repeat,
         critic_sees_true_traits=learned.critic_sees_true_traits,
         monitored=True,
-        scene=list(SCENES) if scene == ALL_SCENES else scene,
-        p_conservative=p_conservative,
-        time_limit_s=min(settings.time_limit_s, *(one.time_limit_s for one in played)),
     )
 
 

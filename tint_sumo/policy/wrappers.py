@@ -1,8 +1,8 @@
 """The environments a policy is trained and tested in: a scene, traits in its observations, decisions now and then."""
 
 import copy
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs.batch import Snapshot
+from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy.trait_sources import Frame, Observation, OracleTraits, TraitSource
-from tint_sumo.scenes import T_INTERSECTION, find_scene
 
 TRAITS, TRUE_TRAITS = "traits", "true_traits"
 _NEEDED = frozenset({"ego", "vehicles", "mask"})
@@ -153,30 +153,30 @@ class ActionRepeat(VecEnvWrapper):
 def policy_venv(
     num_envs: int,
     source: TraitSource | None,
+    settings: Sequence[TaskSettings],
     *,
     action_repeat: int = 1,
     critic_sees_true_traits: bool = False,
     monitored: bool = False,
     on_step: OnStep | None = None,
-    **task: Any,
 ) -> VecEnv:
     """Return ``num_envs`` environments of a scene with the wrappers that a policy needs.
 
     Args:
         num_envs: number of environments.
         source: of the traits in the observations; None leaves them out.
+        settings: of all environments; of several, each has a process for itself, and an equal share of them.
         action_repeat: simulation steps per decision.
         critic_sees_true_traits: observe the true traits, too, under another key.
         monitored: count steps and rewards of each episode for Stable-Baselines3's logger.
         on_step: called with every step of the simulation, as in ``ActionRepeat``; the environments then show the end of
             an episode until they are parked or reset.
-        task: as in ``tint_sumo.envs.scene_env.SceneEnv``.
     """
-    scene = task.get("scene", T_INTERSECTION)
-    if not isinstance(scene, list) and find_scene(scene).sumocfg:  # one simulation per process
-        task["scene"] = [scene] * num_envs
     tracks = source is not None and source.needs_tracks
-    venv: VecEnv = SceneVecEnv(num_envs, tracks=tracks, autoreset=on_step is None, **task)
+    seen = [replace(one, tracks=tracks) for one in settings]
+    if seen[0].scene.sumocfg:  # one simulation per process
+        seen *= num_envs
+    venv: VecEnv = SceneVecEnv(num_envs, seen, autoreset=on_step is None)
     if source is not None:
         venv = TraitObservation(venv, source)
     if critic_sees_true_traits:

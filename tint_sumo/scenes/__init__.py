@@ -11,6 +11,8 @@ from tint_sumo.scenes.registry import (
     AnyScene,
     digest_of,
     find_scene,
+    find_scenes,
+    paper_scene,
     require_built_in,
 )
 from tint_sumo.scenes.scene import EgoTask, Route, Scene, View
@@ -30,7 +32,9 @@ __all__ = [
     "described",
     "digest_of",
     "find_scene",
+    "find_scenes",
     "from_sumocfg",
+    "paper_scene",
     "read_described",
     "read_scene",
     "require_built_in",

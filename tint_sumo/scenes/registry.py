@@ -1,7 +1,7 @@
 """The built-in scenes by their names."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import overload
 
@@ -15,7 +15,7 @@ ALL_SCENES = "all"  # the scene's name for a policy that was trained in every sc
 
 SCENES: dict[str, Callable[[], Scene]] = {}
 
-AnyScene = str | Scene | SumocfgScene
+AnyScene = Scene | SumocfgScene
 
 
 def register(make: Callable[[], Scene]) -> Callable[[], Scene]:
@@ -33,9 +33,9 @@ def register(make: Callable[[], Scene]) -> Callable[[], Scene]:
 @overload
 def find_scene(scene: str | Scene) -> Scene: ...
 @overload
-def find_scene(scene: AnyScene) -> Scene | SumocfgScene: ...
-def find_scene(scene: AnyScene) -> Scene | SumocfgScene:
-    """Return the scene of a name; a scene itself is returned as it is.
+def find_scene(scene: str | AnyScene) -> AnyScene: ...
+def find_scene(scene: str | AnyScene) -> AnyScene:
+    """Return the scene of a name; a scene itself is returned as it is. Commands and users' calls do so once.
 
     Raises:
         InputError: there is none.
@@ -43,32 +43,37 @@ def find_scene(scene: AnyScene) -> Scene | SumocfgScene:
     return find_named("scene", scene, SCENES)() if isinstance(scene, str) else scene
 
 
+def find_scenes(scene: str | AnyScene) -> tuple[AnyScene, ...]:
+    """Return all built-in scenes for ``ALL_SCENES``, and otherwise the one that ``find_scene`` finds."""
+    return tuple(make() for make in SCENES.values()) if scene == ALL_SCENES else (find_scene(scene),)
+
+
+def paper_scene() -> Scene:
+    """Return the T-intersection of the paper."""
+    return find_scene(T_INTERSECTION)
+
+
 def require_built_in(work: str, scene: AnyScene, profiles: int | None = None) -> Scene:
     """Return a scene whose roads and traffic this package makes, as some work needs it.
 
     Args:
         work: beginning of the message, such as ``"a study"``.
-        scene: or its name.
+        scene: the scene.
         profiles: number of profiles of drivers that the scene shall have; any if not given.
 
     Raises:
         InputError: the scene's traffic is that of a SUMO configuration, or its drivers are of more or fewer profiles.
     """
-    found = find_scene(scene)
-    if not isinstance(found, Scene):
+    if not isinstance(scene, Scene):
         raise InputError(f"{work} needs a built-in scene, or one with other numbers, not a SUMO configuration")
-    count = len(found.population.profiles)
+    count = len(scene.population.profiles)
     if profiles not in (None, count):
-        raise InputError(f"{work} needs drivers of {profiles} profiles, and scene {found.name} has {count}")
-    return found
+        raise InputError(f"{work} needs drivers of {profiles} profiles, and scene {scene.name} has {count}")
+    return scene
 
 
-def digest_of(name: str) -> str:
-    """Return the digest of a scene, or of all scenes together.
-
-    Raises:
-        InputError: there is no such scene.
-    """
-    if name != ALL_SCENES:
-        return find_scene(name).digest
-    return hashlib.sha256("".join(make().digest for make in SCENES.values()).encode()).hexdigest()[:16]
+def digest_of(scenes: Sequence[AnyScene]) -> str:
+    """Return the digest of a scene, or of several together."""
+    if len(scenes) == 1:
+        return scenes[0].digest
+    return hashlib.sha256("".join(one.digest for one in scenes).encode()).hexdigest()[:16]

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -32,7 +32,7 @@ from tint_sumo.core.structures import (
     require_base,
     require_known,
 )
-from tint_sumo.scenes.registry import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, digest_of, find_scene
+from tint_sumo.scenes.registry import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, digest_of, find_scene, find_scenes
 from tint_sumo.scenes.scene import Scene, require_scene_name
 from tint_sumo.scenes.sumocfg import SumocfgScene, from_sumocfg
 
@@ -90,11 +90,11 @@ class SceneSettings:
             time_limit_s=scene.time_limit_s,
         )
 
-    def scene(self) -> str | Scene:
-        """Return the scene with these numbers; its name where they are those of the built-in one."""
+    def scene(self) -> Scene:
+        """Return the scene with these numbers; the built-in one where they are its numbers."""
         base = find_scene(self.base)
         if replace(self, name=None) == SceneSettings.of(base):
-            return base.name
+            return base
         ego = replace(base.ego, start_m=self.start_m, goal_m=self.goal_m, controller=self.controller)
         return replace(
             base,
@@ -151,14 +151,11 @@ def _digest(settings: Mapping[str, Any]) -> str:
 def read_scene(value: Any, where: Where = ()) -> AnyScene:
     """Return the scene of a file: a name, what differs from a ``base``, or a ``sumocfg`` and the ego's task.
 
-    Returns:
-        The name of a built-in scene, or another scene.
-
     Raises:
         FieldError: there is no such scene, or a value does not fit.
     """
     if not is_mapping(value, SCENES, where):
-        return require_known(value, SCENES, where)
+        return find_scene(require_known(value, SCENES, where))
     if "sumocfg" in value:
         settings: Any = build(SumocfgSettings, value, where)
     else:
@@ -175,31 +172,31 @@ def scene_settings(scene: AnyScene) -> SceneSettings | SumocfgSettings:
     """Return a scene as a file describes it, in full.
 
     Raises:
-        InputError: there is no such scene, or its roads are those of no built-in one.
+        InputError: its roads are those of no built-in scene.
     """
-    found = find_scene(scene)
-    if isinstance(found, SumocfgScene):
-        return SumocfgSettings.of(found)
-    if (found.base or found.name) not in SCENES:
-        raise InputError(f"the roads of scene {found.name} are of no built-in scene; register it in SCENES")
-    return SceneSettings.of(found)
+    if isinstance(scene, SumocfgScene):
+        return SumocfgSettings.of(scene)
+    if (scene.base or scene.name) not in SCENES:
+        raise InputError(f"the roads of scene {scene.name} are of no built-in scene; register it in SCENES")
+    return SceneSettings.of(scene)
 
 
-def described(scene: AnyScene) -> dict[str, Any]:
-    """Return a scene's entries in the settings and the card of a run; ``read_described`` reads them."""
-    if isinstance(scene, str):
-        return {"scene": scene, "scene_digest": digest_of(scene)}
+def described(scenes: Sequence[AnyScene]) -> dict[str, Any]:
+    """Return the entries that name a scene, or all scenes, in cards and settings of runs; for ``read_described``."""
+    scene, *others = scenes
+    if others:
+        return {"scene": ALL_SCENES, "scene_digest": digest_of(scenes)}
     changed = scene.sumocfg or scene.base
     settings = {"scene_settings": plain(scene_settings(scene))} if changed else {}
     return {"scene": scene.name, "scene_digest": scene.digest, **settings}
 
 
-def read_described(card: Mapping[str, Any]) -> AnyScene:
-    """Return the scene of a card, or the name of all.
+def read_described(card: Mapping[str, Any]) -> tuple[AnyScene, ...]:
+    """Return the scene of a card, or all scenes.
 
     Raises:
         FieldError: there is no such scene, or a value does not fit.
     """
     if card.get("scene") == ALL_SCENES:
-        return ALL_SCENES
-    return read_scene(card.get("scene_settings", card.get("scene")), ("scene",))
+        return find_scenes(ALL_SCENES)
+    return (read_scene(card.get("scene_settings", card.get("scene")), ("scene",)),)

@@ -1,7 +1,7 @@
 """Budgets of studies: everything that sets their cost and their quality, in one place."""
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 from tint_sumo.config import (
     ALL_MIXES,
@@ -20,7 +20,9 @@ from tint_sumo.config import (
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import Range, require_distinct, require_ranges, set_floats
 from tint_sumo.core.structures import Many
+from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.registry import METHODS
+from tint_sumo.scenes import AnyScene
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,9 @@ class Conditions:
         """Whether all cases have one P(conservative), and nothing else differs from the conditions of the training."""
         return self.p_conservative.is_single and self == Conditions(self.p_conservative)
 
-    @property
-    def world(self) -> dict[str, Any]:
-        """What the environments are told; the headway is the scene's unless another one is tested."""
-        told = {"p_conservative": self.p_conservative, "position_noise_m": self.position_noise_m}
-        return told if self.tau_s is None else {**told, "tau_s": self.tau_s}
+    def task(self, scene: AnyScene) -> TaskSettings:
+        """Return the settings of environments in a scene."""
+        return TaskSettings(scene, self.p_conservative, position_noise_m=self.position_noise_m, tau_s=self.tau_s)
 
     def resolved(self, scene_tau_s: float) -> "Conditions":
         """Return these conditions with the headway of the scene's drivers where none is given."""

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from tint_sumo.config import Mix
 from tint_sumo.envs.episodes import episode_seed
 from tint_sumo.methods.evaluation import BATCH, case_seed
-from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene
+from tint_sumo.scenes import Scene, paper_scene
 from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.scene import SceneSimulation
 
 
-def ceiling(p_conservative: Mix, episodes: int, seed: int = 0, scene: str | Scene = T_INTERSECTION) -> float:
+def ceiling(p_conservative: Mix, episodes: int, seed: int = 0, scene: Scene | None = None) -> float:
     """Share of the cases in which enough yielding drivers come in time.
 
     A careful ego enters a route only before a driver that yields. It knows all traits, never brakes on its way and
@@ -23,9 +23,9 @@ def ceiling(p_conservative: Mix, episodes: int, seed: int = 0, scene: str | Scen
 
     Args:
         p_conservative, episodes, seed: of the cases, see ``tint_sumo.methods.evaluation.evaluate``.
-        scene: name of the scene, or a scene.
+        scene: where; the paper's if not given.
     """
-    played = find_scene(scene)
+    played = scene or paper_scene()
     played = replace(played, traffic=replace(played.traffic, p_conservative=p_conservative))
     finished = 0
     simulation = SceneSimulation(min(BATCH, episodes), played, with_ego=False)

@@ -1,6 +1,6 @@
 """The study's job of finding what a careful driver can reach at best."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tint_sumo.core.files import damaged, read_record, write_json
@@ -8,7 +8,7 @@ from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Progress, Report
 from tint_sumo.core.reading import RESULT_BYTES
 from tint_sumo.methods.evaluation import CASES
-from tint_sumo.scenes import T_INTERSECTION, Scene
+from tint_sumo.scenes import Scene, paper_scene
 from tint_sumo.study.budgets import Trials
 from tint_sumo.study.ceiling import ceiling
 
@@ -21,7 +21,7 @@ class CeilingJob:
 
     trials: tuple[Trials, ...]
     out: Path  # folder of the study
-    scene: str | Scene = T_INTERSECTION
+    scene: Scene = field(default_factory=paper_scene)
 
     name = "ceilings"
     needs = ()

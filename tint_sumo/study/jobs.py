@@ -1,7 +1,7 @@
 """The study's jobs of training policies and of testing them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pandas as pd
@@ -18,7 +18,7 @@ from tint_sumo.methods.evaluation import CASES, Evaluation, evaluate
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.registry import METHODS, Rule, find_learned, find_method
 from tint_sumo.methods.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
-from tint_sumo.scenes import T_INTERSECTION, AnyScene, Scene, find_scene
+from tint_sumo.scenes import Scene, paper_scene
 from tint_sumo.study.budgets import Conditions, Trials
 from tint_sumo.study.folders import RESULTS, trait_folder
 from tint_sumo.study.results import GIVEN, TRAINED, Measured, Result
@@ -36,7 +36,7 @@ class TrainJob:
     settings: PpoSettings
     shipped_traits: bool  # rather than a trait model of the study
     out: Path  # folder of the study
-    scene: AnyScene = T_INTERSECTION
+    scene: Scene = field(default_factory=paper_scene)
 
     uses_gpu = True
 
@@ -102,7 +102,7 @@ class EvaluateJob:
     seed: int
     trials: tuple[Trials, ...]
     out: Path  # folder of the study
-    scene: str | Scene = T_INTERSECTION
+    scene: Scene = field(default_factory=paper_scene)
     cases: int = CASES  # which set of cases
 
     uses_gpu = False
@@ -148,7 +148,7 @@ class EvaluateJob:
             tested.append(Measured(conditions, evaluation))
             done += episodes
         origin = GIVEN if self.mix is None else TRAINED
-        scene_tau_s = find_scene(self.scene).tau_s
+        scene_tau_s = self.scene.tau_s
         result = Result(self.method, origin, self.mix, self.seed, tuple(tested), self.cases, scene_tau_s)
         write_json(self.result_file, result.to_json())
         successes = ", ".join(f"{percent(one.evaluation.rate('success').value)}%" for one in tested)
@@ -165,7 +165,7 @@ class EvaluateJob:
         contender = load_policy(path, scene=self.scene if self.mix is None else None)
         return evaluate(
             contender.policy,
-            lambda num_envs: contender.make_venv(num_envs, **conditions.world),
+            lambda num_envs: contender.make_venv(num_envs, conditions.task(contender.scene)),
             episodes,
             self.cases,
             report=report,

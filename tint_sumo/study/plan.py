@@ -9,7 +9,7 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.methods.loading import shipped_policies
 from tint_sumo.methods.registry import Learned, find_learned, find_method, with_shared_trainings
-from tint_sumo.scenes import T_INTERSECTION, Scene, described, digest_of, find_scene, require_built_in
+from tint_sumo.scenes import T_INTERSECTION, AnyScene, Scene, described, find_scene, paper_scene, require_built_in
 from tint_sumo.study.budgets import Budget
 from tint_sumo.study.ceiling_job import CeilingJob
 from tint_sumo.study.folders import DATASET
@@ -19,8 +19,9 @@ from tint_sumo.study.report import StudyReport, write_report
 from tint_sumo.study.trait_job import SEED, TraitJob
 
 
-def plan(budget: Budget, out: Path, scene: str | Scene = T_INTERSECTION) -> list[Job]:
+def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
     """All jobs after the recording, those that hold up others or take longest first, one seed after the other."""
+    scene = scene or paper_scene()
     learned = [name for name in budget.methods if isinstance(find_method(name), Learned)]
     rules = [name for name in budget.methods if name not in learned]
     trained = with_shared_trainings(learned)
@@ -28,8 +29,8 @@ def plan(budget: Budget, out: Path, scene: str | Scene = T_INTERSECTION) -> list
         find_learned(name).settings_of(budget.ppo)  # refuses what does not fit before hours of work
     encoders = dict.fromkeys(filter(None, (find_learned(name).encoder for name in trained)))
     traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
-    given = rules + (shipped_policies() if budget.with_shipped and scene == T_INTERSECTION else [])
-    trials = tuple(one.relative_to(find_scene(scene).tau_s) for one in budget.trials)
+    given = rules + (shipped_policies() if budget.with_shipped and scene == paper_scene() else [])
+    trials = tuple(one.relative_to(scene.tau_s) for one in budget.trials)
     jobs: list[Job] = [*traits]
     for seed in budget.seeds:
         trainings = [
@@ -60,9 +61,10 @@ def run_study(
         JobError: jobs were given up; all others are done.
     """
     executor = executor_of(workers)
-    _require_traits(budget, require_scene("a study", scene))
-    jobs = plan(budget, out, scene)
-    place = {} if scene == T_INTERSECTION else described(scene)
+    found = require_scene("a study", find_scene(scene))
+    _require_traits(budget, found)
+    jobs = plan(budget, out, found)
+    place = {} if found == paper_scene() else described([found])
     with claim_folder(out, {"kind": "study", **plain(budget), **place}):
         if budget.traits is not None:
             record(
@@ -70,7 +72,7 @@ def run_study(
                 budget.windows,
                 p_conservative=budget.record_p_conservative,
                 seed=SEED,
-                scene=scene,
+                scene=found,
                 workers=executor,
                 progress=progress,
             )
@@ -78,7 +80,7 @@ def run_study(
         return write_page(write_report(out), out, workers=executor, progress=progress)
 
 
-def require_scene(work: str, scene: str | Scene) -> Scene:
+def require_scene(work: str, scene: AnyScene) -> Scene:
     """The scene, if this work, such as ``"a study"``, can be done there.
 
     Raises:
@@ -89,7 +91,7 @@ def require_scene(work: str, scene: str | Scene) -> Scene:
 
 def _require_traits(budget: Budget, scene: Scene) -> None:
     """Raise InputError unless the study has trait models for the scene."""
-    if budget.traits is None and scene.digest != digest_of(T_INTERSECTION):
+    if budget.traits is None and scene.digest != paper_scene().digest:
         raise InputError(
             f"the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; give the budget traits, and "
             "windows to learn them from, as the budget quick has"

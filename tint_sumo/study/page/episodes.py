@@ -29,13 +29,13 @@ class Recorded:
 class Recordings:
     """Policies and episodes that the player can show."""
 
-    scene: str | Scene
+    scene: Scene
     choice: Choice
     policies: tuple[Recorded, ...]
     refusals: tuple[str, ...]  # why policies are not among them
 
 
-def record_episodes(out: Path, scene: str | Scene, choice: Choice, *, workers: Workers, progress: bool) -> Recordings:
+def record_episodes(out: Path, scene: Scene, choice: Choice, *, workers: Workers, progress: bool) -> Recordings:
     """Record the chosen cases of all policies that can be loaded, as far as they are not there already.
 
     Raises:

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,7 +27,7 @@ from tint_sumo.methods.evaluation import CASES, CASES_PER_SEED
 from tint_sumo.methods.loading import Contender, find_policy, load_policy
 from tint_sumo.methods.registry import METHODS, Rule
 from tint_sumo.policy.storage import read_policy_card, weights_file
-from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene
+from tint_sumo.scenes import Scene, described, paper_scene
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.jobs import label, policy_folder, policy_path
 
@@ -110,7 +110,7 @@ class Recording:
     conditions: Conditions
     cases: tuple[int, ...]
     out: Path  # folder of the study
-    scene: str | Scene = T_INTERSECTION  # scene of the study
+    scene: Scene = field(default_factory=paper_scene)  # scene of the study
 
     @property
     def label(self) -> str:
@@ -148,7 +148,7 @@ class Recording:
             "policy": _digest(self._policy),
             "conditions": plain(self.conditions),
             "cases": self.cases,
-            "scene": described(self.scene),
+            "scene": described([self.scene]),
         }
         read: dict[str, Any] = json.loads(json.dumps(identity))
         return read
@@ -163,11 +163,12 @@ class Recording:
 
     def make(self, report: Report) -> None:
         contender = self._contender()
-        reader, routes = fit_reader(contender), [route.name for route in find_scene(self.scene).routes]
+        reader, routes = fit_reader(contender), [route.name for route in self.scene.routes]
         episodes = {}
         for done, case in enumerate(self.cases):
             report(Progress(done, len(self.cases), "case"))
-            episodes[str(case)] = encode(drive_case(contender, case, CASES, **self.conditions.world), reader, routes)
+            driven = drive_case(contender, case, CASES, self.conditions.task(contender.scene))
+            episodes[str(case)] = encode(driven, reader, routes)
         content = {"recorded": self._identity, "episodes": episodes}
         write_text(self.file, json.dumps(content, separators=(",", ":")))
 

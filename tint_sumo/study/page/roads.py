@@ -6,19 +6,18 @@ import numpy as np
 import shapely
 
 from tint_sumo.films.frames import HALO_M, LEAST_WEIGHT
-from tint_sumo.scenes import Scene, find_scene
+from tint_sumo.scenes import Scene
 from tint_sumo.scenes.geometry import SPACING_M, Floats, as_line
 from tint_sumo.scenes.layout import layout
 
 _TOLERANCE_M = 0.02
 
 
-def scene_shapes(place: str | Scene) -> dict[str, Any]:
+def scene_shapes(scene: Scene) -> dict[str, Any]:
     """Shapes of a scene as SVG paths in m; y leads down the picture, as in SVG.
 
     ``view`` is left, top, width and height.
     """
-    scene = find_scene(place)
     roads, view, task = layout(scene), scene.view, scene.ego
     half_m = scene.network.lane_width_m / 2
     lanes = [as_line(_part(path.way, 0.0, path.length_m)) for path in roads.routes]

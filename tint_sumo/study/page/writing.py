@@ -18,7 +18,7 @@ from tint_sumo.core.files import RUN_FILE, damaged, read_json, write_text
 from tint_sumo.jobs import Workers
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import read_versions
-from tint_sumo.scenes import T_INTERSECTION, Scene, read_described, require_built_in
+from tint_sumo.scenes import Scene, paper_scene, read_described, require_built_in
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.page.charts import Chart, condition_charts, curve_chart, outcome_chart
 from tint_sumo.study.page.choosing import choose
@@ -79,7 +79,7 @@ def write_page(report: StudyReport, out: Path, *, workers: Workers = 2, progress
     return replace(report, page_file=out / PAGE_FILE)
 
 
-def read_scene_of(out: Path) -> str | Scene:
+def read_scene_of(out: Path) -> Scene:
     """The scene of the study in ``out``: the paper's, unless its settings name another one.
 
     Raises:
@@ -87,9 +87,9 @@ def read_scene_of(out: Path) -> str | Scene:
     """
     settings = read_json(out / RUN_FILE, "run settings") if (out / RUN_FILE).exists() else {}
     if "scene" not in settings:
-        return T_INTERSECTION
+        return paper_scene()
     try:
-        return require_built_in("a study", read_described(settings))
+        return require_built_in("a study", read_described(settings)[0])
     except InputError as error:
         raise damaged(out / RUN_FILE, "run settings", error) from None
 

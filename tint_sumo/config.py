@@ -11,9 +11,9 @@ from itertools import pairwise
 from numbers import Real
 from typing import Annotated, Any, Literal, Self
 
-from tint_sumo.core.errors import InputError, find_named, shown
+from tint_sumo.core.errors import InputError, shown
 from tint_sumo.core.ranges import Length, Range, require_ranges
-from tint_sumo.core.structures import FieldError, FileForm, Many, ReadBy, Where, build, choose
+from tint_sumo.core.structures import FileForm, Many
 
 NO_LEADER_GAP_M = 20.0  # stands for the gap of every driver without a leader, whatever its trait, and caps all gaps
 MIN_WINDOW_STEPS = 2  # shortest window; a single step has no motion
@@ -149,39 +149,6 @@ class Population:
 
 
 POPULATIONS = {"traits": Population(), "continuous": Population((CONTINUOUS,), members=512)}
-
-
-def read_population(value: Any, where: Where = ()) -> Population:
-    """What a file means by a population: a name, a list of profiles, or what differs from its ``base``.
-
-    Raises:
-        FieldError: there is no such population, or a value does not fit.
-    """
-    if not isinstance(value, list):
-        chosen = choose(value, POPULATIONS, "traits", where)
-        return POPULATIONS[chosen] if isinstance(chosen, str) else chosen
-    profiles = build(tuple[DriverProfile, ...], value, where)
-    try:
-        return Population(profiles)
-    except InputError as error:
-        raise FieldError(where, str(error)) from None
-
-
-PopulationSetting = Annotated[Population, ReadBy(read_population)]
-
-
-def find_population(name: str) -> Population:
-    """The population called ``name``.
-
-    Raises:
-        InputError: there is none.
-    """
-    return find_named("population", name, POPULATIONS)
-
-
-def population_name(population: Population) -> str | None:
-    """What a population is called, if it is one that has a name."""
-    return next((name for name, known in POPULATIONS.items() if known == population), None)
 
 
 @dataclass(frozen=True, order=True, init=False)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.scenes.networks import UserNetwork
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DRIVER_PROFILES, POPULATIONS, Population, read_population
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DRIVER_PROFILES, POPULATIONS, Population
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.structures import plain
 from tint_sumo.scenes import (
@@ -21,6 +21,7 @@ from tint_sumo.scenes import (
     read_scene,
     scene_settings,
 )
+from tint_sumo.scenes.drivers import read_population
 
 SHY = {
     "name": "shy",

@@ -38,7 +38,7 @@ def _scene_in_full(value: Any) -> Any:
 
 
 def _read_population(value: Any, where: Where) -> Any:
-    from tint_sumo.config import population_name, read_population
+    from tint_sumo.scenes.drivers import population_name, read_population
 
     if value is None:
         return None
@@ -47,7 +47,7 @@ def _read_population(value: Any, where: Where) -> Any:
 
 
 def _population_in_full(value: Any) -> Any:
-    from tint_sumo.config import find_population
+    from tint_sumo.scenes.drivers import find_population
 
     return find_population(value) if isinstance(value, str) else value
 

@@ -9,12 +9,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import AnyMix, Mix, Population, find_population, population_name
+from tint_sumo.config import AnyMix, Mix, Population
 from tint_sumo.core.structures import plain
 from tint_sumo.dataset.schema import SCHEMA_VERSION, Manifest
 from tint_sumo.dataset.shards import EPISODE_STEPS, record_dataset, require_sizes
 from tint_sumo.jobs import Workers
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene, paper_scene
+from tint_sumo.scenes.drivers import find_population, population_name
 from tint_sumo.scenes.geometry import Floats, Numbers
 from tint_sumo.simulation.scene import SceneSimulation
 

@@ -17,12 +17,13 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tint_sumo.config import NO_LEADER_GAP_M, WINDOW_STEPS, DriverProfile, Mix, TrafficSeed, read_population
+from tint_sumo.config import NO_LEADER_GAP_M, WINDOW_STEPS, DriverProfile, Mix, TrafficSeed
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_json
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.reading import TABLE_BYTES, require_file, require_unpacked_bytes
 from tint_sumo.core.structures import FieldError, build, is_required, plain
+from tint_sumo.scenes.drivers import read_population
 
 SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"

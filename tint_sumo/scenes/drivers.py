@@ -1,18 +1,53 @@
-"""Driver vTypes: several IDM members per trait, and the vTypeDistribution plain SUMO draws from.
+"""Populations of drivers, and their vTypes: several IDM members per trait, and the distribution plain SUMO draws from.
 
 Source: https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_Types,_and_Routes.html
 """
 
 from collections import Counter
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 
-from tint_sumo.config import KINDS, DriverProfile, Idm, Population, VehicleShape
-from tint_sumo.core.errors import InputError
+from tint_sumo.config import KINDS, POPULATIONS, DriverProfile, Idm, Population, VehicleShape
+from tint_sumo.core.errors import InputError, find_named
+from tint_sumo.core.structures import FieldError, ReadBy, Where, build, choose
 
 DISTRIBUTION_ID = "drivers"
 EGO_TYPE = "ego"
+
+
+def read_population(value: Any, where: Where = ()) -> Population:
+    """Return the population that a file gives: a name, a list of profiles, or what differs from its ``base``.
+
+    Raises:
+        FieldError: there is no such population, or a value does not fit.
+    """
+    if not isinstance(value, list):
+        chosen = choose(value, POPULATIONS, "traits", where)
+        return POPULATIONS[chosen] if isinstance(chosen, str) else chosen
+    profiles = build(tuple[DriverProfile, ...], value, where)
+    try:
+        return Population(profiles)
+    except InputError as error:
+        raise FieldError(where, str(error)) from None
+
+
+PopulationSetting = Annotated[Population, ReadBy(read_population)]
+
+
+def find_population(name: str) -> Population:
+    """Return the population called ``name``.
+
+    Raises:
+        InputError: there is none.
+    """
+    return find_named("population", name, POPULATIONS)
+
+
+def population_name(population: Population) -> str | None:
+    """Return the name of a population, if it has one."""
+    return next((name for name, known in POPULATIONS.items() if known == population), None)
 
 
 def require_two_kinds(kinds: int, method: str, drivers: str) -> None:

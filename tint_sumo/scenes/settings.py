@@ -12,7 +12,6 @@ from tint_sumo.config import (
     Claim,
     DistanceM,
     EgoController,
-    PopulationSetting,
     Slots,
     StepS,
     TimeS,
@@ -32,6 +31,7 @@ from tint_sumo.core.structures import (
     require_base,
     require_known,
 )
+from tint_sumo.scenes.drivers import PopulationSetting
 from tint_sumo.scenes.registry import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, digest_of, find_scene, find_scenes
 from tint_sumo.scenes.scene import Scene, require_scene_name
 from tint_sumo.scenes.sumocfg import SumocfgScene, from_sumocfg

@@ -24,7 +24,7 @@ from tint_sumo.methods.registry import (
     register,
 )
 from tint_sumo.policy import ClassifierTraits, EncoderTraits, NoTraits, OracleTraits, StreamingTraits
-from tint_sumo.scenes import T_INTERSECTION
+from tint_sumo.scenes import paper_scene
 from tint_sumo.traits import TraitModel
 
 LEARNED = learned_methods()
@@ -91,7 +91,7 @@ def test_rules_act() -> None:
     observation = {"ego": np.zeros((3, 4)), "vehicles": np.zeros((3, 12, 2)), "mask": np.zeros((3, 12))}
     for method in METHODS.values():
         if isinstance(method, Rule):
-            actions, _ = method.make(T_INTERSECTION).predict(observation)
+            actions, _ = method.make(paper_scene()).predict(observation)
             assert actions.shape == (3,)
 
 

@@ -306,9 +306,11 @@ def test_policies_and_films_of_other_drivers(
     message = "method oracle needs exactly two kinds of drivers, and scene three has 3"
     assert message in refuse(capsys, "policy", "train", "--method", "oracle", "--config", file)
     run(capsys, "policy", "train", "--method", "no_labels", "--config", file)
-    assert "a film needs drivers of 2 profiles" in refuse(capsys, "render", "--model", "run", "--out", "film.png")
+    assert "a film needs exactly two kinds of drivers" in refuse(
+        capsys, "render", "--model", "run", "--out", "film.png"
+    )
     study = ("study", "run", "--config", written(tmp_path, scene), "--out", "study")
-    assert "a study needs drivers of 2 profiles, and scene three has 3" in refuse(capsys, *study)
+    assert "a study needs exactly two kinds of drivers, and scene three has 3" in refuse(capsys, *study)
     assert not Path("study").exists()
 
 

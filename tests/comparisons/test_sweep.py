@@ -199,7 +199,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 
 def test_scenes_with_other_drivers_than_two_profiles_are_refused(brief: PpoSettings) -> None:
     scene = replace(find_scene("on_ramp"), name="own", population=Population((CONSERVATIVE,)))
-    with pytest.raises(InputError, match="a sweep needs drivers of 2 profiles, and scene own has 1"):
+    with pytest.raises(InputError, match="a sweep needs exactly two kinds of drivers, and scene own has 1"):
         Sweep(brief, {"n_epochs": [1]}, scene=scene)
 
 

@@ -22,6 +22,7 @@ from tint_sumo.methods.evaluation import CASES_PER_SEED, require_seed
 from tint_sumo.methods.loading import Contender
 from tint_sumo.methods.registry import look_of
 from tint_sumo.scenes import AnyScene, Scene, require_built_in
+from tint_sumo.scenes.drivers import require_two_kinds
 from tint_sumo.scenes.layout import layout
 
 SUFFIXES = (".mp4", ".gif", ".png")
@@ -81,7 +82,9 @@ def render_case(
 
 def require_film_scene(scene: AnyScene) -> Scene:
     """Return a scene; InputError unless a film can show it."""
-    return require_built_in("a film", scene, profiles=2)
+    found = require_built_in("a film", scene)
+    require_two_kinds(len(found.traits), "a film", f"scene {found.name}")
+    return found
 
 
 def require_film_file(out: Path) -> None:

@@ -147,14 +147,14 @@ def _restore(model: RecurrentPPO, tensors: Tensors, state: _State) -> None:
 
 
 def _shown(model: RecurrentPPO) -> Tensors:
-    """Last observations and hidden states of the policy, as tensors that share memory with the model."""
+    """Return the last observations and hidden states of the policy, as tensors that share memory with the model."""
     assert isinstance(model._last_obs, dict) and model._last_episode_starts is not None
     seen = {f"{_OBSERVATION}{key}": torch.from_numpy(array) for key, array in model._last_obs.items()}
     return {**seen, _STARTS: torch.from_numpy(model._last_episode_starts), _HIDDEN: model.hidden_states}
 
 
 def _memory(there: VenvSnapshot) -> Tensors:
-    """State of the wrappers, as tensors that share memory with the snapshot."""
+    """Return the state of the wrappers, as tensors that share memory with the snapshot."""
     return {
         f"{_MEMORY}{number}.{name}": torch.as_tensor(array)
         for number, memory in enumerate(there.memories)
@@ -163,7 +163,7 @@ def _memory(there: VenvSnapshot) -> Tensors:
 
 
 def _episodes(venv: VecEnv, tensors: Tensors, state: _State) -> list[Snapshot]:
-    """Snapshots of the environments."""
+    """Return the snapshots of the environments."""
     assert isinstance(venv.action_space, spaces.Discrete)
     counts, actions = tensors[_COUNTS].tolist(), tensors[_ACTIONS].tolist()
     if not len(counts) == len(state.began) == venv.num_envs:

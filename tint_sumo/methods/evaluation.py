@@ -1,4 +1,4 @@
-"""Every method meets the same unseen cases."""
+"""Evaluation of policies on unseen cases, which are the same for every method."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -60,7 +60,7 @@ class Evaluation:
         return dict(sorted(hits.items()))
 
     def summary(self) -> dict[str, Any]:
-        """Rates as fractions with 95 % intervals, and what else is worth knowing, ready for JSON."""
+        """Return rates as fractions with 95 % intervals, mean time and collisions, ready for JSON."""
         rates = {outcome: self.rate(outcome) for outcome in OUTCOMES}
         return {
             **{outcome: rate.value for outcome, rate in rates.items()},
@@ -72,7 +72,7 @@ class Evaluation:
 
 
 def case_seed(seed: int, number: int = 0) -> int:
-    """Environment seed of case ``number`` of the set of cases ``seed``."""
+    """Return the environment seed of case ``number`` of the set of cases ``seed``."""
     return CASE_SEED + seed * CASES_PER_SEED + number
 
 
@@ -130,7 +130,7 @@ def evaluate(
 
 
 def _first_episodes(policy: Policy, venv: VecEnv, first_seed: int, wanted: int) -> Iterator[tuple[int, Case]]:
-    """Index and first episode of each of the first ``wanted`` environments, as they end."""
+    """Yield index and first episode of each of the first ``wanted`` environments, as they end."""
     venv.seed(first_seed)
     observation: Any = venv.reset()
     state, starts = None, np.ones(venv.num_envs, bool)

@@ -122,7 +122,7 @@ def evaluate_on(
 
 
 def _copy_model(model: str, out: Path) -> str:
-    """Copy a policy's files, and those beside it that it may need; how to name it there."""
+    """Copy a policy's files, and those beside it that it may need; return its path there."""
     given = Path(model)
     if not given.exists():
         return model

@@ -56,7 +56,7 @@ class Contender:
 def load_policy(
     name_or_path: str | Path, *, scene: str | AnyScene | None = None, allow_pickle: bool = False
 ) -> Contender:
-    """A hand-written rule or a shipped policy by its name, or a trained one by its folder or file.
+    """Return a hand-written rule or a shipped policy by its name, or a trained one by its folder or file.
 
     The card, a .json file beside the weights, names the method and the trait model.
 
@@ -146,7 +146,7 @@ def _contender(stem: Path, policy: Any) -> Contender:
 
 
 def _load_encoder(stem: Path, card: dict[str, Any]) -> TraitModel:
-    """The trait model that the policy was trained with: the one beside it in a run, or a shipped one by its name."""
+    """Return the trait model of the policy's training: the file beside it in a run, or a shipped model by its name."""
     named = card["traits"]
     encoder = traits.load(weights_file(stem.with_name(TRAITS)) if named == TRAITS else named, latent_size=LATENT_SIZE)
     if digest(encoder) != card.get("traits_sha256"):
@@ -155,7 +155,7 @@ def _load_encoder(stem: Path, card: dict[str, Any]) -> TraitModel:
 
 
 def find_policy(name_or_path: str | Path) -> Path:
-    """The path of a policy without its suffix.
+    """Return the path of a policy without its suffix.
 
     Raises:
         InputError: there is no such policy.
@@ -176,7 +176,7 @@ def find_policy(name_or_path: str | Path) -> Path:
 
 
 def shipped_policies() -> list[str]:
-    """Names of the policies that come with the package, in the order of the methods."""
+    """Return the names of the policies that come with the package, in the order of the methods."""
     return [name for name in METHODS if weights_file(shipped("models") / "policies" / name).is_file()]
 
 

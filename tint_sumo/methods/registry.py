@@ -32,7 +32,7 @@ class Policy(Protocol):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[Any], Any]:
-        """Actions (N,) for N observations, and the state for the next call."""
+        """Return actions (N,) for N observations, and the state for the next call."""
 
 
 @dataclass(frozen=True)

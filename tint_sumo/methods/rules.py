@@ -28,7 +28,7 @@ class AlwaysGo:
         episode_start: NDArray[np.bool_] | None = None,  # noqa: ARG002
         deterministic: bool = True,  # noqa: ARG002
     ) -> tuple[NDArray[np.int64], State | None]:
-        """Actions (N,) for N observations; arguments and result as in Stable-Baselines3's ``predict``."""
+        """Return actions (N,) for N observations; arguments and result as in Stable-Baselines3's ``predict``."""
         return np.full(len(observation["ego"]), GO), state
 
 
@@ -56,9 +56,9 @@ class TimeToCollision:
     scene: AnyScene = field(default_factory=paper_scene)
 
     @cached_property
-    def _world(self) -> "_World":
+    def _geometry(self) -> "_Geometry":
         scene = require_built_in("ttc", self.scene)
-        return _World(layout(scene))
+        return _Geometry(layout(scene))
 
     def predict(
         self,
@@ -67,39 +67,39 @@ class TimeToCollision:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,  # noqa: ARG002
     ) -> tuple[NDArray[np.int64], State]:
-        """Actions (N,) for N observations; arguments and result as in Stable-Baselines3's ``predict``.
+        """Return actions (N,) for N observations; arguments and result as in Stable-Baselines3's ``predict``.
 
         The state holds what was seen last: the centre's distance along its route (m) and presence of each slot's
         vehicle, both (N, V).
         """
-        world = self._world
+        geometry = self._geometry
         ego_m = observation["ego"][:, :2].astype(np.float64) * POSITION_SCALE_M
         centre_m = observation["vehicles"] * POSITION_SCALE_M + ego_m[:, None]
         present = observation["mask"] > 0.5
-        route, along_m = world.on_routes(centre_m)
-        speed_mps = speeds_mps(along_m, present, state, episode_start, world.step_s)
+        route, along_m = geometry.on_routes(centre_m)
+        speed_mps = speeds_mps(along_m, present, state, episode_start, geometry.step_s)
         blocking = present & (self.times_s(route, along_m, speed_mps) <= self.threshold_s)
 
-        front_m = world.ego_front_m(ego_m)[:, None]
-        line_m = world.enter_m - self.line_margin_m
+        front_m = geometry.ego_front_m(ego_m)[:, None]
+        line_m = geometry.enter_m - self.line_margin_m
         next_line_m = np.r_[line_m[1:], np.inf]
-        ahead = (front_m < next_line_m) & (front_m < world.inside_m)  # (N, K): routes the ego has yet to cross
-        crossing = ((front_m >= world.enter_m) & (front_m < next_line_m))[:, :-1].any(axis=1)
-        blocked = np.stack([(blocking & (route == one)).any(axis=1) for one in world.order], axis=1)
+        ahead = (front_m < next_line_m) & (front_m < geometry.inside_m)  # (N, K): routes the ego has yet to cross
+        crossing = ((front_m >= geometry.enter_m) & (front_m < next_line_m))[:, :-1].any(axis=1)
+        blocked = np.stack([(blocking & (route == one)).any(axis=1) for one in geometry.order], axis=1)
         go = crossing | ~(blocked & ahead).any(axis=1)
         wait = np.where(front_m[:, 0] < line_m[0], CREEP, STOP)
         return np.where(go, GO, wait), (along_m, present.astype(np.float64))
 
     def times_s(self, route: NDArray[np.int64], along_m: Floats, speed_mps: Floats) -> Floats:
-        """Time until each vehicle reaches the conflict zone on its route, from its centre's distance along it."""
-        before_path_m = self._world.meet_m[route] - along_m
-        to_zone_m = np.maximum(before_path_m - self._world.half_length_m - self.zone_margin_m, 0.0)
+        """Return the time until each vehicle reaches its route's conflict zone, from its centre's distance along it."""
+        before_path_m = self._geometry.meet_m[route] - along_m
+        to_zone_m = np.maximum(before_path_m - self._geometry.half_length_m - self.zone_margin_m, 0.0)
         reach_s = np.full(along_m.shape, np.inf)
         np.divide(to_zone_m, speed_mps, out=reach_s, where=speed_mps > 0.0)
         return np.select([before_path_m < 0.0, to_zone_m == 0.0], [np.inf, 0.0], reach_s)
 
 
-class _World:
+class _Geometry:
     """Geometry of a scene for the rule, with the routes in the order in which the ego meets them."""
 
     def __init__(self, layout: Layout) -> None:
@@ -122,7 +122,7 @@ class _World:
         self._ego_centres_m = np.r_[0.0, np.cumsum(np.hypot(*np.diff(centres, axis=0).T))]
 
     def on_routes(self, centre_m: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """The nearest route of each centre (N, V, 2), and its distance along it; both (N, V)."""
+        """Return the nearest route of each centre (N, V, 2), and its distance along it; both (N, V)."""
         points = centre_m.reshape(-1, 2)
         found = [project(points, line) for line in self._lines]
         nearest = np.argmin([off_m for _, off_m in found], axis=0)
@@ -142,7 +142,7 @@ def speeds_mps(
     episode_start: NDArray[np.bool_] | None,
     step_s: float,
 ) -> Floats:
-    """Speeds along the routes, (N, V); the ego's top speed for vehicles not seen at the step before."""
+    """Return the speeds along the routes, (N, V); the ego's top speed for vehicles not seen at the step before."""
     if state is None:
         return np.full(along_m.shape, SPEED_SCALE_MPS)
     was_along_m, was_present = state

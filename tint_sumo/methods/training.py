@@ -174,7 +174,7 @@ def _require_drivers(learned: Learned, p_conservative: Mix | None, scene: AnySce
     """Raise InputError unless a method can be trained among a scene's drivers, in such a mix."""
     kinds = len(scene.with_drivers(p_conservative, None).traits)
     if learned.sees_true_traits:
-        require_two_kinds(kinds, learned.name, f"scene {scene.name}")
+        require_two_kinds(kinds, f"method {learned.name}", f"scene {scene.name}")
 
 
 def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | None:
@@ -192,7 +192,7 @@ def training_venv(
     settings: PpoSettings,
     scenes: Sequence[AnyScene],
 ) -> VecEnv:
-    """Environments with the traits that the method is trained with."""
+    """Return environments with the traits that the method is trained with."""
     time_limit_s = min(settings.time_limit_s, *(one.time_limit_s for one in scenes))
     shown = learned if learned.trained_as is None else find_learned(learned.trained_as)
     return policy_venv(
@@ -273,7 +273,7 @@ def new_model(venv: VecEnv, seed: int, settings: PpoSettings) -> RecurrentPPO:
 
 
 def _training_seed(seed: int) -> int:
-    """Seed of the first environment; below every case's seed."""
+    """Return the seed of the first environment; below every case's seed."""
     sequence = np.random.SeedSequence((seed, 0))  # of two numbers, as when the shipped policies were trained
     return int(sequence.generate_state(1)[0]) % (CASE_SEED // 2)
 
@@ -357,7 +357,7 @@ class _Watch(BaseCallback):
 
 
 def read_curve(out: Path) -> list[list[str]]:
-    """Rows of a training's curve: decisions, then the shares of the outcomes; none if there is no file yet."""
+    """Return the rows of a training's curve: decisions, then shares of outcomes; none if there is no file yet."""
     try:
         lines = (out / CURVE_FILE).read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:

@@ -50,18 +50,16 @@ def population_name(population: Population) -> str | None:
     return next((name for name, known in POPULATIONS.items() if known == population), None)
 
 
-def require_two_kinds(kinds: int, method: str, drivers: str) -> None:
-    """Raise InputError unless there are exactly two kinds of drivers, as methods that use labels need.
+def require_two_kinds(kinds: int, work: str, drivers: str) -> None:
+    """Raise InputError unless there are exactly two kinds of drivers, as labels, films and studies need.
 
     Args:
         kinds: number of kinds.
-        method: name of the method.
+        work: beginning of the message, such as ``"a film"``.
         drivers: whose drivers they are, for the message.
     """
     if kinds != KINDS:
-        raise InputError(
-            f"method {method} needs exactly two kinds of drivers, and {drivers} has {kinds}; choose another method"
-        )
+        raise InputError(f"{work} needs exactly two kinds of drivers, and {drivers} has {kinds}; choose other drivers")
 
 
 @dataclass(frozen=True)

@@ -53,22 +53,18 @@ def paper_scene() -> Scene:
     return find_scene(T_INTERSECTION)
 
 
-def require_built_in(work: str, scene: AnyScene, profiles: int | None = None) -> Scene:
+def require_built_in(work: str, scene: AnyScene) -> Scene:
     """Return a scene whose roads and traffic this package makes, as some work needs it.
 
     Args:
         work: beginning of the message, such as ``"a study"``.
         scene: the scene.
-        profiles: number of profiles of drivers that the scene shall have; any if not given.
 
     Raises:
-        InputError: the scene's traffic is that of a SUMO configuration, or its drivers are of more or fewer profiles.
+        InputError: the scene's traffic is that of a SUMO configuration.
     """
     if not isinstance(scene, Scene):
         raise InputError(f"{work} needs a built-in scene, or one with other numbers, not a SUMO configuration")
-    count = len(scene.population.profiles)
-    if profiles not in (None, count):
-        raise InputError(f"{work} needs drivers of {profiles} profiles, and scene {scene.name} has {count}")
     return scene
 
 

@@ -15,7 +15,7 @@ from tint_sumo.simulation.scene import SceneSimulation
 
 
 def ceiling(p_conservative: Mix, episodes: int, seed: int = 0, scene: Scene | None = None) -> float:
-    """Share of the cases in which enough yielding drivers come in time.
+    """Return the share of the cases in which enough yielding drivers come in time.
 
     A careful ego enters a route only before a driver that yields. It knows all traits, never brakes on its way and
     needs no room to the vehicle that passes before the yielding driver, so that no careful policy does better. One that
@@ -42,7 +42,7 @@ def ceiling(p_conservative: Mix, episodes: int, seed: int = 0, scene: Scene | No
 
 
 def _finishes(simulation: SceneSimulation) -> NDArray[np.bool_]:
-    """Which replicas let a careful ego through before the time limit; (R,)."""
+    """Return which replicas let a careful ego through before the time limit; (R,)."""
     scene, layout = simulation.scene, simulation.layout
     way_s = way_m(layout) / max(scene.ego.controller.desired_speeds_mps)
     openings = _openings(simulation)
@@ -58,7 +58,7 @@ def _finishes(simulation: SceneSimulation) -> NDArray[np.bool_]:
 
 
 def way_m(layout: Layout) -> NDArray[np.float64]:
-    """Lengths of the ego's way to the first route's lane, from there to the next one's, and so on to the goal."""
+    """Return the lengths of the ego's way to the first route's lane, from there to the next, and on to the goal."""
     task = layout.scene.ego
     return np.diff([task.start_m, *np.sort(layout.zones.enter_m), task.goal_m])
 

@@ -50,7 +50,7 @@ class CeilingJob:
 
 
 def read_ceilings(out: Path) -> dict[float, float]:
-    """Ceilings by P(conservative); none if the study has not computed them.
+    """Return the ceilings by P(conservative); none if the study has not computed them.
 
     Raises:
         InputError: the file is damaged.

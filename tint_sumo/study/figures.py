@@ -23,7 +23,7 @@ _PANELS = 3  # panels in a row
 
 
 def plot_bars(rows: Sequence[Summary], file: Path) -> Path:
-    """Stacked bars of success, timeout and collision as in the paper's Fig. 4, one panel per P(conservative)."""
+    """Draw stacked bars of success, timeout and collision as in the paper's Fig. 4, one panel per P(conservative)."""
     panels = [(p, list(group)) for p, group in groupby(rows, key=lambda row: row.conditions.p_conservative.low)]
     columns = min(len(panels), _PANELS)
     lines = -(-len(panels) // columns)
@@ -78,7 +78,7 @@ def _plot_panel(axes: Axes, rows: Sequence[Summary]) -> None:
 
 
 def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Path:
-    """Success in training against decisions: the mean over seeds, and the range between them as a band.
+    """Draw success in training against decisions: the mean over seeds, and the range between them as a band.
 
     Args:
         curves: of each method, a frame per seed with columns decisions and success.
@@ -98,7 +98,7 @@ def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Pat
 
 
 def plot_conditions(rows: Sequence[Summary], file: Path) -> Path:
-    """Success in conditions other than those of the training, and after parts of the training; a line per method."""
+    """Draw success in other conditions than the training's, and after parts of the training; a line per method."""
     figure = Figure(figsize=(11.0, 4.2), dpi=150, layout="constrained")
     all_axes = figure.subplots(1, 3, sharey=True)
     for axes, (name, title) in zip(all_axes, CONDITION_TITLES.items(), strict=True):

@@ -5,5 +5,5 @@ RESULTS = "results"  # a file for each result
 
 
 def trait_folder(method: str) -> str:
-    """Folder of a trait model that the study trains."""
+    """Return the folder of a trait model that the study trains."""
     return f"traits/{method}"

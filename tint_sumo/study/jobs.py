@@ -173,14 +173,14 @@ class EvaluateJob:
 
 
 def label(method: str, mix: Mix | None, seed: int) -> str:
-    """Name of a policy in the files of a study."""
+    """Return the name of a policy in the files of a study."""
     if mix is None:
         return method if isinstance(find_method(method), Rule) else f"{method}-shipped"
     return f"{method}-P{mix.text.replace(' ', '')}-seed{seed}"
 
 
 def policy_folder(method: str, mix: Mix, seed: int) -> str:
-    """Folder of a policy that a study trains, relative to the study's."""
+    """Return the folder of a policy that a study trains, relative to the study's."""
     return f"policies/{label(method, mix, seed)}"
 
 
@@ -192,7 +192,7 @@ def policy_path(out: Path, method: str, mix: Mix | None, seed: int, percent: int
 
 
 def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
-    """Curves of the trainings of the study in ``out``, one per seed, by method in the registry's order.
+    """Return the curves of the trainings of the study in ``out``, one per seed, by method in the registry's order.
 
     A training in which no episode has ended yet has none.
 
@@ -205,7 +205,7 @@ def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
 
 
 def smoothed_percent(seeds: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """Success in training, %: a row for each number of decisions, a column for each seed."""
+    """Return success in training, %: a row for each number of decisions, a column for each seed."""
     shares = [one.set_index("decisions")["success"].rolling(_SMOOTHED, min_periods=1).mean() for one in seeds]
     return 100.0 * pd.concat(shares, axis=1).dropna()
 

@@ -10,6 +10,7 @@ from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.methods.loading import shipped_policies
 from tint_sumo.methods.registry import Learned, find_learned, find_method, with_shared_trainings
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, Scene, described, find_scene, paper_scene, require_built_in
+from tint_sumo.scenes.drivers import require_two_kinds
 from tint_sumo.study.budgets import Budget
 from tint_sumo.study.ceiling_job import CeilingJob
 from tint_sumo.study.folders import DATASET
@@ -20,7 +21,7 @@ from tint_sumo.study.trait_job import SEED, TraitJob
 
 
 def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
-    """All jobs after the recording, those that hold up others or take longest first, one seed after the other."""
+    """Return all jobs after the recording, seed by seed, those first that others wait for or that take longest."""
     scene = scene or paper_scene()
     learned = [name for name in budget.methods if isinstance(find_method(name), Learned)]
     rules = [name for name in budget.methods if name not in learned]
@@ -81,12 +82,14 @@ def run_study(
 
 
 def require_scene(work: str, scene: AnyScene) -> Scene:
-    """The scene, if this work, such as ``"a study"``, can be done there.
+    """Return the scene, if this work, such as ``"a study"``, can be done there.
 
     Raises:
         InputError: it cannot.
     """
-    return require_built_in(work, scene, profiles=2)
+    found = require_built_in(work, scene)
+    require_two_kinds(len(found.traits), work, f"scene {found.name}")
+    return found
 
 
 def _require_traits(budget: Budget, scene: Scene) -> None:

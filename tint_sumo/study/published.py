@@ -1,4 +1,4 @@
-"""Results of the paper, to stand beside one's own."""
+"""Results of the paper, for comparison."""
 
 # Success, timeout and collision in percent of 500 episodes, by method and P(conservative); paper Fig. 4.
 RATES_PERCENT: dict[tuple[str, float], tuple[float, float, float]] = {

@@ -58,7 +58,7 @@ def to_markdown(tables: Sequence[Table]) -> str:
 
 
 def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
-    """All tables for readers."""
+    """Return all tables for readers."""
     main, varied = at_mixes(rows), over_all_mixes(rows)
     tables = []
     if main:
@@ -138,7 +138,7 @@ def _collision_lines(rows: Sequence[Row]) -> Lines:
 
 
 def _compared(rows: Sequence[Row]) -> list[Row]:
-    """Rows of methods with several trainings."""
+    """Return the rows of methods with several trainings."""
     return [row for row in rows if len(row.seeds) > 1]
 
 
@@ -177,7 +177,7 @@ def _condition_lines(rows: Sequence[Summary]) -> Lines:
 
 
 def _number(row: Summary) -> float:
-    """P(conservative) of a row's cases; NaN where each case has its own."""
+    """Return P(conservative) of a row's cases; NaN where each case has its own."""
     p = row.conditions.p_conservative
     return p.low if p.is_single else math.nan
 

@@ -109,7 +109,7 @@ class _Stored:
 
 
 def read_results(out: Path) -> list[Result]:
-    """Results of all finished jobs of the study in ``out``.
+    """Return the results of all finished jobs of the study in ``out``.
 
     Raises:
         InputError: there are none, a file is damaged, or they are of other cases than those that studies report.

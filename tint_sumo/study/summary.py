@@ -48,11 +48,11 @@ class Summary(ABC):
 
     @abstractmethod
     def rate(self, outcome: str) -> float:
-        """Share of the cases with an outcome, over all seeds."""
+        """Return the share of the cases with an outcome, over all seeds."""
 
     @abstractmethod
     def spread(self, outcome: str) -> float | None:
-        """Standard deviation between the seeds; None with one seed."""
+        """Return the standard deviation between the seeds; None with one seed."""
 
     @property
     @abstractmethod
@@ -77,7 +77,7 @@ class Summary(ABC):
 
     @property
     def published(self) -> dict[str, float]:
-        """The paper's rates in percent, empty where it has none; for its own conditions alone."""
+        """The paper's rates in percent, empty where it has none; for the paper's conditions alone."""
         if not self.conditions.is_single_mix:
             return {}
         p_conservative = self.conditions.p_conservative.low
@@ -95,7 +95,7 @@ class Row(Summary):
         return len(self.evaluations[0].cases)
 
     def hits(self, outcome: str) -> Hits:
-        """(seeds, cases): where there was an outcome."""
+        """Return whether there was an outcome, (seeds, cases)."""
         return np.array([[case.outcome == outcome for case in one.cases] for one in self.evaluations])
 
     def rate(self, outcome: str) -> float:
@@ -147,7 +147,7 @@ AnyRow = TypeVar("AnyRow", bound=Summary)
 
 
 def tabulate(results: Sequence[Result]) -> list[Row]:
-    """One row per conditions, origin, method and mix in training; methods in the registry's order."""
+    """Return one row per conditions, origin, method and mix in training; methods in the registry's order."""
     order = {name: position for position, name in enumerate(METHODS)}
     flat = [(result, one) for result in results for one in result.tested]
 
@@ -180,23 +180,23 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
 
 
 def at_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
-    """The rows of the main table: fully trained, the default conditions, one P(conservative) each."""
+    """Return the rows of the main table: fully trained, the default conditions, one P(conservative) each."""
     return [row for row in rows if row.conditions.is_single_mix]
 
 
 def over_all_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
-    """The rows of other conditions and parts of the training, where every case has a mix of its own."""
+    """Return the rows of other conditions and parts of the training, where every case draws its mix."""
     return [row for row in rows if not row.conditions.p_conservative.is_single]
 
 
 def by_method(rows: Sequence[AnyRow]) -> list[AnyRow]:
-    """The rows in the registry's order, whatever the conditions; shipped policies come first."""
+    """Return the rows in the registry's order, whatever the conditions; shipped policies come first."""
     order = {name: position for position, name in enumerate(METHODS)}
     return sorted(rows, key=lambda row: (order.get(row.method, len(order)), row.origin != GIVEN))
 
 
 def by_title(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
-    """The rows of each method, shipped policies apart, in the registry's order."""
+    """Return the rows of each method, shipped policies apart, in the registry's order."""
     found: dict[str, list[AnyRow]] = {}
     for row in by_method(rows):
         found.setdefault(row.title, []).append(row)

@@ -20,7 +20,7 @@ class Table:
 
 
 def markdown_table(lines: Lines) -> str:
-    """A Markdown table, whose columns also align as plain text."""
+    """Return a Markdown table, whose columns also align as plain text."""
     widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
     rows = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines

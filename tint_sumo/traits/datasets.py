@@ -162,7 +162,7 @@ def _load_for_test(
 def first_of_two(labels: NDArray[np.int64], method: str) -> NDArray[np.bool_]:
     """Return which drivers are of the first of two kinds: conservative, or of the first vType."""
     kinds = np.unique(labels)
-    require_two_kinds(len(kinds), method, "the dataset")
+    require_two_kinds(len(kinds), f"method {method}", "the dataset")
     return np.asarray(labels == kinds[0])
 
 

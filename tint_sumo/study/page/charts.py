@@ -19,7 +19,7 @@ _SYMBOLS = {
     **{">": "triangle-right", "P": "cross", "X": "x", "*": "star", "h": "hexagon"},
 }
 _DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
-# Mixes are no methods: all have one colour, and markers of their own.
+# Mixes are no methods: all have the same colour, and different markers.
 _MIX_COLOUR, _MIX_MARKERS = "#70757a", "oD^sv*PXh"
 _ROW_PX = 46  # height of a method's row
 _CURVE_LINES = 10  # rows of the table of learning curves
@@ -34,7 +34,7 @@ class Chart:
 
 
 def outcome_chart(rows: Sequence[Summary], outcome: str) -> Chart:
-    """Rates of an outcome with intervals: a line of the chart for each method, a marker for each mix."""
+    """Return the chart of an outcome's rates with intervals: a line for each method, a marker for each mix."""
     titles = list(by_title(rows))
     mixes = sorted({row.conditions.p_conservative for row in rows})
     traces, lines = [], [["method", "P(conservative)", f"{outcome} %", "95 % interval"]]
@@ -72,7 +72,7 @@ def outcome_chart(rows: Sequence[Summary], outcome: str) -> Chart:
 
 
 def curve_chart(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Chart:
-    """Success in training against decisions: the mean over the seeds, and the range between them as a band."""
+    """Return the chart of success in training against decisions: the mean over the seeds, and their range as a band."""
     traces: list[dict[str, Any]] = []
     lines = [["method", "decisions", "success %", "range of the seeds"]]
     for method, seeds in curves.items():
@@ -97,7 +97,7 @@ def curve_chart(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Chart:
 
 
 def condition_charts(rows: Sequence[Summary]) -> list[Chart]:
-    """Success against each condition in which the rows differ from the conditions of the training."""
+    """Return charts of success against each condition in which the rows differ from the conditions of the training."""
     charts = []
     for name, title in CONDITION_TITLES.items():
         traces, lines = [], [["method", title, "success %", "95 % interval"]]

@@ -1,4 +1,4 @@
-"""Which policies of a study are shown, and in which cases."""
+"""Choice of the policies and cases that the page's player shows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -53,7 +53,7 @@ def choose(rows: Sequence[Row]) -> Choice:
 
 
 def choose_cases(evaluations: Sequence[Evaluation]) -> tuple[int, ...]:
-    """Numbers of cases in which policies fail, first those of the policies that rarely do, and of some successes.
+    """Return the cases in which policies fail, first those of the policies that rarely do, and of some successes.
 
     A case in which several policies fail counts for all of them.
     """

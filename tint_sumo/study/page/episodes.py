@@ -82,7 +82,7 @@ def player_data(recordings: Recordings) -> str:
 
 
 def _opening(policies: Sequence[Recorded]) -> Shown:
-    """The policy that is shown first: the most successful one of those that infer traits, or else of all."""
+    """Return the policy that is shown first: the most successful one of those that infer traits, or else of all."""
     inferring = [one for one in policies if getattr(METHODS.get(one.policy.method), "encoder", None)]
     return max((one.policy for one in inferring or policies), key=lambda one: one.evaluation.rate("success").value)
 

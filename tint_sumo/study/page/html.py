@@ -12,7 +12,7 @@ from tint_sumo.study.tables import Lines
 
 
 def table(lines: Lines, caption: str) -> str:
-    """A table of cells in a box that scrolls by itself; the first line is its header, the first column its rows'.
+    """Return a table in a box that scrolls; the first line is its header, the first column the headers of the rows.
 
     Every cell knows the name of its column, which stands beside it on a phone, where each row is a block.
     """
@@ -35,7 +35,7 @@ def table(lines: Lines, caption: str) -> str:
 
 
 def folded(summary: str, *content: str) -> str:
-    """Something that opens when it is asked for, and in print."""
+    """Return an element that opens on a click, and in print."""
     return f"<details><summary>{escape(summary)}</summary>{''.join(content)}</details>"
 
 
@@ -50,14 +50,14 @@ def section(name: str, title: str, *content: str) -> str:
 
 
 def chart(name: str, description: str, lines: Lines) -> str:
-    """The place of a chart, and its numbers as a table."""
+    """Return the element of a chart, and its numbers as a table."""
     return f'<div class="chart" data-chart="{name}" role="img" aria-label="{escape(description)}"></div>' + folded(
         f"The numbers: {description}", table(lines, description)
     )
 
 
 def json_data(name: str, value: Any) -> str:
-    """Data that scripts read by their name."""
+    """Return data that scripts read by their name."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")  # no tag ends it early
     return f'<script type="application/json" id="{name}">{text}</script>'
 
@@ -91,5 +91,5 @@ def _source(text: str) -> str:
 
 
 def bullets(lines: Sequence[str]) -> str:
-    """A list of pieces of HTML."""
+    """Return a list of pieces of HTML."""
     return f"<ul>{''.join(f'<li>{line}</li>' for line in lines)}</ul>"

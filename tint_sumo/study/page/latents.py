@@ -21,7 +21,7 @@ _STEP_M = 0.01  # what offsets and gaps are multiples of
 
 
 def read_latents(out: Path, methods: Sequence[str], *, progress: bool) -> dict[str, Any] | None:
-    """Windows of drivers that no model was trained on, and where each of the methods' trait models puts them.
+    """Return windows of drivers that no model was trained on, with their latents by each of the methods' trait models.
 
     None if no method infers traits with a model. The windows are recorded once.
 
@@ -57,7 +57,7 @@ def read_latents(out: Path, methods: Sequence[str], *, progress: bool) -> dict[s
 
 
 def _states(windows: Windows, one: int) -> dict[str, list[int | None]]:
-    """The window's valid steps; no gap where there is no leader."""
+    """Return the window's valid steps; no gap where there is no leader."""
     steps = windows.states[one, : windows.length[one]]
     offsets, gaps = np.rint(steps / _STEP_M).astype(int).T.tolist()
     led = steps[:, 1] < NO_LEADER_GAP_M

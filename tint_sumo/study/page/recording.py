@@ -222,7 +222,7 @@ def record_all(recordings: Sequence[Recording], out: Path, workers: Workers, pro
 
 
 def read_episodes(file: Path) -> dict[int, dict[str, Any]]:
-    """The episode of each case.
+    """Return the episode of each case.
 
     Raises:
         InputError: the file is missing or damaged.

@@ -14,7 +14,7 @@ _TOLERANCE_M = 0.02
 
 
 def scene_shapes(scene: Scene) -> dict[str, Any]:
-    """Shapes of a scene as SVG paths in m; y leads down the picture, as in SVG.
+    """Return the shapes of a scene as SVG paths in m; y leads down the picture, as in SVG.
 
     ``view`` is left, top, width and height.
     """
@@ -45,7 +45,7 @@ def _part(way: Floats, from_m: float, to_m: float) -> Floats:
 
 
 def _rings(area: shapely.Geometry) -> list[Floats]:
-    """Outlines and holes."""
+    """Return outlines and holes."""
     polygons = shapely.get_parts(shapely.simplify(area, _TOLERANCE_M))
     rings = [ring for polygon in polygons for ring in (polygon.exterior, *polygon.interiors)]
     return [shapely.get_coordinates(ring) for ring in rings]

@@ -80,7 +80,7 @@ def write_page(report: StudyReport, out: Path, *, workers: Workers = 2, progress
 
 
 def read_scene_of(out: Path) -> Scene:
-    """The scene of the study in ``out``: the paper's, unless its settings name another one.
+    """Return the scene of the study in ``out``: the paper's, unless its settings name another one.
 
     Raises:
         InputError: the settings are damaged.
@@ -226,7 +226,7 @@ def _making(study: _Study) -> str:
 
 
 def _flat(value: Any, name: str) -> Iterator[tuple[str, str]]:
-    """Names and values of nested settings."""
+    """Return names and values of nested settings."""
     if isinstance(value, Mapping):
         for key, part in value.items():
             yield from _flat(part, f"{name}.{key}" if name else str(key))
@@ -239,7 +239,7 @@ def _seeds(rows: Sequence[Row]) -> dict[str, tuple[int, ...]]:
 
 
 def _versions(out: Path) -> Lines:
-    """Versions of the packages that trained the policies; all of them where policies differ."""
+    """Return the versions of the packages at the training; all of them where policies differ."""
     found: dict[str, dict[str, None]] = {}
     for file in sorted(out.glob(f"policies/*/{POLICY}.json")):
         for package, version in read_versions(file.with_suffix("")).items():

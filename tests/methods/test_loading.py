@@ -19,6 +19,7 @@ from tint_sumo.methods.registry import METHODS, Learned
 from tint_sumo.methods.rules import AlwaysGo, TimeToCollision
 from tint_sumo.methods.training import train_policy
 from tint_sumo.policy import EncoderTraits, NoTraits
+from tint_sumo.policy.storage import load_policy_network, read_policy_card, save_policy
 from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION, digest_of, find_scenes
 from tint_sumo.traits.storage import save
 
@@ -136,6 +137,14 @@ def test_a_missing_card(run: Path) -> None:
     (run / "policy.json").unlink()
     assert "card of the policy: no file" in refused(run)
     assert "card of the policy: no file" in refused(run / "policy.zip", allow_pickle=True)
+
+
+def test_a_policy_whose_outputs_overflow_is_refused(run: Path) -> None:
+    """Its weights are finite."""
+    policy = load_policy_network(run / "policy")
+    policy.load_state_dict({name: weight * 1e12 for name, weight in policy.state_dict().items()})
+    save_policy(policy, run / "policy", read_policy_card(run / "policy"))
+    assert refused(run).startswith(f"{run / 'policy.safetensors'}: the policy's outputs are not finite")
 
 
 def test_a_damaged_card(run: Path) -> None:

@@ -36,7 +36,8 @@ Backend = Literal["auto", "libsumo", "traci"]
 
 # Numbers that several settings have, with what is sensible; larger ones would fill the memory, or are mistakes.
 Fraction = Annotated[float, Range(0.0, 1.0)]
-Seed = Annotated[int, Range(0, 1000)]  # of a training, or of a set of cases
+SEEDS = Range(0, 1000)
+Seed = Annotated[int, SEEDS]  # of a training
 TrafficSeed = Annotated[int, Range(0, 2**32 - 1)]
 SpeedMps = Annotated[float, Range(0.0, 60.0)]
 DistanceM = Annotated[float, Range(0.0, 1000.0)]

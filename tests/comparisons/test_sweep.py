@@ -15,7 +15,7 @@ from tint_sumo.config import CONSERVATIVE, Mix, Population, PpoSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import silent
 from tint_sumo.envs import TaskSettings
-from tint_sumo.methods.evaluation import TUNING_CASES, evaluate
+from tint_sumo.methods.evaluation import TUNING_SET, evaluate
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.scenes import find_scene
 from tint_sumo.study.budgets import Conditions
@@ -65,10 +65,10 @@ def test_policies_are_tested_on_cases_that_are_reported_nowhere(finished: Path) 
         policy.policy,
         lambda count: policy.make_venv(count, TaskSettings(policy.scene, p_conservative=0.4)),
         3,
-        TUNING_CASES,
+        TUNING_SET,
     )
     result = Result.read(finished / VARIANTS[0] / "results" / "oracle-P0.4-seed0.json")
-    assert (result.case_set, result.tested) == (TUNING_CASES, (Measured(Conditions(Mix(0.4)), expected),))
+    assert (result.case_set, result.tested) == (TUNING_SET, (Measured(Conditions(Mix(0.4)), expected),))
 
 
 @pytest.mark.slow

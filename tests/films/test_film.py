@@ -184,14 +184,14 @@ def test_mp4_without_its_extra_names_it(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_bad_input_leaves_no_file(tmp_path: Path) -> None:
     contender = load_policy("always_go")
-    for case, seed, name, message in (
+    for case, case_set, name, message in (
         (0, 0, "film.avi", r"film\.avi must end in \.mp4, \.gif or \.png; choose another `out`"),
         (-1, 0, "film.gif", "case must lie in 0 to 999999, not -1"),
         (1_000_000, 0, "film.gif", "case must lie in 0 to 999999"),
-        (0, 1001, "film.gif", "seed must lie in 0 to 1000"),
+        (0, 1001, "film.gif", "case_set must lie in 0 to 1000"),
     ):
         with pytest.raises(InputError, match=message):
-            render_case(contender, case, tmp_path / name, seed=seed)
+            render_case(contender, case, tmp_path / name, case_set=case_set)
     assert not list(tmp_path.iterdir())
 
 

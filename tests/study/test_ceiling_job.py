@@ -5,7 +5,7 @@ import pytest
 from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Progress
-from tint_sumo.methods.evaluation import CASES
+from tint_sumo.methods.evaluation import REPORTED_SET
 from tint_sumo.study import budgets
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling import ceiling
@@ -26,7 +26,7 @@ def test_there_is_a_ceiling_for_each_mix_of_the_training_s_conditions(tmp_path: 
     line = job.run(told.append)
     assert job.is_done()
     assert told == [Progress(0, 15, "case"), Progress(10, 15, "case")]
-    expected = ceiling(Mix(0.1), 10, CASES)
+    expected = ceiling(Mix(0.1), 10, REPORTED_SET)
     assert read_ceilings(tmp_path) == {0.1: expected, 0.0: 0.0}
     assert line == f"P 0.1: {expected:.1%}, P 0: 0.0%"
 

@@ -11,7 +11,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
 from tint_sumo.core.progress import Progress, silent
 from tint_sumo.envs import TaskSettings
-from tint_sumo.methods.evaluation import CASES, evaluate
+from tint_sumo.methods.evaluation import REPORTED_SET, evaluate
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.registry import METHODS
 from tint_sumo.methods.training import CURVE_FILE
@@ -120,7 +120,10 @@ def test_a_rule_is_tested_on_the_same_cases_as_everyone_but_not_after_parts_of_a
     ]
     rule = load_policy("always_go")
     found = evaluate(
-        rule.policy, lambda num_envs: rule.make_venv(num_envs, TaskSettings(rule.scene, p_conservative=0.4)), 4, CASES
+        rule.policy,
+        lambda num_envs: rule.make_venv(num_envs, TaskSettings(rule.scene, p_conservative=0.4)),
+        4,
+        REPORTED_SET,
     )
     assert result.tested[0].evaluation == found
 

@@ -8,7 +8,7 @@ import pytest
 from tests.study.scenes import given, trained, write_results
 from tint_sumo.config import ALL_MIXES, Idm, Mix
 from tint_sumo.core.errors import InputError
-from tint_sumo.methods.evaluation import TUNING_CASES
+from tint_sumo.methods.evaluation import TUNING_SET
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.report import write_report
@@ -67,7 +67,7 @@ def test_a_policy_that_no_test_is_for_has_no_cases(tmp_path: Path) -> None:
 
 
 def test_results_of_a_sweep_are_no_study_s(tmp_path: Path) -> None:
-    tuned = replace(SOME_RESULTS[0], case_set=TUNING_CASES)
+    tuned = replace(SOME_RESULTS[0], case_set=TUNING_SET)
     write_results([tuned], tmp_path)
     assert Result.read(tmp_path / RESULTS / "0.json") == tuned
     with pytest.raises(InputError, match="is part of a sweep, whose cases no study reports"):

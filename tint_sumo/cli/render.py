@@ -40,7 +40,7 @@ class Render(Command):
         contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
         task = task_of(contender, self.p_conservative, self.noise, self.tau)
         with one_job(f"render {self.out}") as report:
-            film = render_case(contender, self.case, self.out, seed=self.seed, task=task, report=report)
+            film = render_case(contender, self.case, self.out, case_set=self.seed, task=task, report=report)
         text = f"{film.outcome} after {film.time_s:.1f} s, {film.frames} frames: {self.out}"
         content = {"model": self.model, **content_of(task), "case": self.case, "seed": self.seed}
         return Outcome(text, {**content, "out": str(self.out), **asdict(film)})

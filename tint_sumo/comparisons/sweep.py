@@ -13,6 +13,7 @@ import pandas as pd
 from tint_sumo.config import (
     ALL_MIXES,
     P_CONSERVATIVE,
+    SEEDS,
     Mix,
     PolicySettings,
     PpoSettings,
@@ -25,7 +26,7 @@ from tint_sumo.core.structures import overlay, plain, require_fields
 from tint_sumo.core.yaml_files import read_list
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.jobs import Workers, executor_of
-from tint_sumo.methods.evaluation import TUNING_CASES, require_cases, require_seed
+from tint_sumo.methods.evaluation import TUNING_SET, require_cases
 from tint_sumo.methods.registry import METHODS, Learned, find_learned, with_shared_trainings
 from tint_sumo.scenes import T_INTERSECTION, Scene, described, paper_scene
 from tint_sumo.study.budgets import Conditions, Trials
@@ -58,8 +59,8 @@ class Sweep:
     def __post_init__(self) -> None:
         require_distinct(self, "methods", "seeds")
         for seed in self.seeds:
-            require_seed(seed)
-        require_cases(self.episodes, TUNING_CASES)
+            SEEDS.require("seed", seed)
+        require_cases(self.episodes, TUNING_SET)
         if not self.tested:
             tested = ", ".join(f"{p:g}" for p in P_CONSERVATIVE)
             trained = self.p_conservative.text
@@ -211,9 +212,7 @@ def _trainings(sweep: Sweep, out: Path) -> list[VariantJob]:
 def _tests(sweep: Sweep, out: Path) -> list[VariantJob]:
     trials = (Trials(tuple(Conditions(Mix(p)) for p in sweep.tested), sweep.episodes),)
     return [
-        VariantJob(
-            variant, EvaluateJob(method, sweep.p_conservative, seed, trials, out, sweep.scene, TUNING_CASES), out
-        )
+        VariantJob(variant, EvaluateJob(method, sweep.p_conservative, seed, trials, out, sweep.scene, TUNING_SET), out)
         for variant in sweep.variants
         for method in sweep.methods
         for seed in sweep.seeds
@@ -243,7 +242,7 @@ def report_markdown(table: pd.DataFrame, episodes: int) -> str:
     """Success by variant and method, means and standard deviations over the seeds; the best line comes first."""
     note = (
         f"Success in percent of {episodes} cases at each P(conservative), ± the standard deviation between training "
-        f"seeds; mean: over all P. The cases are of set {TUNING_CASES}, which settings are chosen on and which is "
+        f"seeds; mean: over all P. The cases are of set {TUNING_SET}, which settings are chosen on and which is "
         "reported nowhere. The best of many lines is also a lucky one, so test what you choose on other cases."
     )
     return "\n\n".join(Table("Success by settings of PPO", _lines(table), note).markdown) + "\n"

@@ -52,13 +52,13 @@ class Driven:
     moments: tuple[Moment, ...]
 
 
-def drive_case(contender: Contender, case: int, seed: int, task: TaskSettings) -> Driven:
-    """Evaluate a policy on case ``case`` of the set ``seed``, and keep every step of the simulation.
+def drive_case(contender: Contender, case: int, case_set: int, task: TaskSettings) -> Driven:
+    """Evaluate a policy on case ``case`` of a case set, and keep every step of the simulation.
 
     Args:
         contender: the policy.
         case: number of the case, as in ``tint_sumo.methods.evaluation.evaluate``.
-        seed: which set of cases.
+        case_set: number of the case set.
         task: settings of the environment.
     """
     recorder = _Recorder(contender)
@@ -68,7 +68,7 @@ def drive_case(contender: Contender, case: int, seed: int, task: TaskSettings) -
         recorder.attach(venv)
         return venv
 
-    evaluation = evaluate(recorder, make_venv, 1, seed, first=case)
+    evaluation = evaluate(recorder, make_venv, 1, case_set, first=case)
     return Driven(evaluation.cases[0], tuple(recorder.moments))
 
 

@@ -18,7 +18,7 @@ from tint_sumo.envs.rendering import RENDER_FPS
 from tint_sumo.films.driving import Moment, drive_case
 from tint_sumo.films.frames import SIZE_PX, Artist
 from tint_sumo.films.trait_probe import fit_reader
-from tint_sumo.methods.evaluation import CASES_PER_SEED, require_seed
+from tint_sumo.methods.evaluation import CASE_SETS, CASES_PER_SET
 from tint_sumo.methods.loading import Contender
 from tint_sumo.methods.registry import look_of
 from tint_sumo.scenes import AnyScene, Scene, require_built_in
@@ -44,7 +44,7 @@ def render_case(
     case: int,
     out: Path,
     *,
-    seed: int = 0,
+    case_set: int = 0,
     task: TaskSettings | None = None,
     report: Report = silent,
 ) -> Film:
@@ -56,7 +56,7 @@ def render_case(
         contender: who drives.
         case: number of the case, as in ``tint_sumo.methods.evaluation.evaluate``.
         out: .mp4, .gif or .png file.
-        seed: which set of cases, 0 to 1000.
+        case_set: number of the case set, 0 to 1000.
         task: settings of the environment; those of the contender if not given.
         report: called with the progress.
 
@@ -64,14 +64,14 @@ def render_case(
         InputError: there is no such case, or no such kind of film, or what writes it is not installed.
     """
     require_film_file(out)
-    require_seed(seed)
-    if not 0 <= case < CASES_PER_SEED:
-        raise InputError(f"case must lie in 0 to {CASES_PER_SEED - 1}, not {case}")
+    CASE_SETS.require("case_set", case_set)
+    if not 0 <= case < CASES_PER_SET:
+        raise InputError(f"case must lie in 0 to {CASES_PER_SET - 1}, not {case}")
     task = task or contender.task
     played = require_film_scene(task.scene)
-    driven = drive_case(contender, case, seed, task)
+    driven = drive_case(contender, case, case_set, task)
     shown = _spread(driven.moments) if out.suffix.lower() == ".png" else driven.moments
-    parts = (Path(contender.name).name, played.name, f"case {case} of set {seed}", _words(task.p_conservative))
+    parts = (Path(contender.name).name, played.name, f"case {case} of set {case_set}", _words(task.p_conservative))
     has_attention = driven.moments[0].attention is not None
     colour = ImageColor.getrgb(look_of(contender.method).colour)
     artist = Artist(layout(played), (" " * 5).join(parts), colour, fit_reader(contender), has_attention)

@@ -17,10 +17,10 @@ from tint_sumo.methods.registry import Policy
 
 # Seed of the first case. Training draws its environments' seeds below this number, so no case is ever trained on.
 CASE_SEED = 1_000_000_000
-CASES_PER_SEED = 1_000_000
-MAX_SEED = 1000
-CASES = 0  # the set of cases that studies report
-TUNING_CASES = 1000  # the set that settings are chosen on, which is reported nowhere
+CASES_PER_SET = 1_000_000
+CASE_SETS = Range(0, 1000)
+REPORTED_SET = 0  # case set of studies
+TUNING_SET = 1000  # case set on which settings are chosen; reported nowhere
 BATCH = 100  # environments at a time
 _STOP = 0  # action of environments whose case is over
 
@@ -71,57 +71,52 @@ class Evaluation:
         }
 
 
-def case_seed(seed: int, number: int = 0) -> int:
-    """Return the environment seed of case ``number`` of the set of cases ``seed``."""
-    return CASE_SEED + seed * CASES_PER_SEED + number
+def case_seed(case_set: int, number: int = 0) -> int:
+    """Return the environment seed of case ``number`` of a case set."""
+    return CASE_SEED + case_set * CASES_PER_SET + number
 
 
-def require_seed(seed: int) -> None:
-    """Raise InputError unless ``seed`` lies in 0 to 1000."""
-    if not 0 <= seed <= MAX_SEED:
-        raise InputError(f"seed must lie in 0 to {MAX_SEED}, not {seed}")
-
-
-def require_cases(episodes: int, seed: int, first: int = 0) -> None:
-    """Raise InputError unless a set of cases has so many, from the case ``first`` on."""
-    require_seed(seed)
-    if not 1 <= episodes <= CASES_PER_SEED - first:
-        raise InputError(f"episodes must lie in 1 to {CASES_PER_SEED}, not {episodes}")
+def require_cases(episodes: int, case_set: int, first: int = 0) -> None:
+    """Raise InputError unless there is such a case set, and it has so many cases, from the case ``first`` on."""
+    CASE_SETS.require("case_set", case_set)
+    if not 1 <= episodes <= CASES_PER_SET - first:
+        raise InputError(f"episodes must lie in 1 to {CASES_PER_SET}, not {episodes}")
 
 
 def evaluate(
     policy: Policy,
     make_venv: Callable[[int], VecEnv],
     episodes: int,
-    seed: int,
+    case_set: int,
     *,
     first: int = 0,
     batch: int = BATCH,
     report: Report = silent,
 ) -> Evaluation:
-    """Run ``policy`` with its likeliest actions through the cases ``first``, ``first + 1``, ... of the set ``seed``.
+    """Run ``policy`` with its likeliest actions through the cases ``first``, ``first + 1``, ... of a case set.
 
-    Case i is the first episode of an environment seeded with ``case_seed(seed, i)``, whatever the method and the batch.
+    Case i is the first episode of an environment seeded with ``case_seed(case_set, i)``, whatever the method and the
+    batch.
 
     Args:
         policy: a rule or a Stable-Baselines3 model; recurrent states are carried along.
         make_venv: makes the vector environment of so many environments; closed at the end.
         episodes: number of cases.
-        seed: which set of cases, 0 to 1000.
+        case_set: number of the case set, 0 to 1000.
         first: number of the first case.
         batch: environments at a time.
         report: called with the progress.
 
     Raises:
-        InputError: no episodes, too many, or a seed out of range.
+        InputError: no episodes, too many, or no such case set.
     """
-    require_cases(episodes, seed, first)
+    require_cases(episodes, case_set, first)
     cases: dict[int, Case] = {}
     venv = make_venv(min(batch, episodes))
     try:
         for done in range(0, episodes, venv.num_envs):
             wanted = min(venv.num_envs, episodes - done)
-            for index, case in _first_episodes(policy, venv, case_seed(seed, first + done), wanted):
+            for index, case in _first_episodes(policy, venv, case_seed(case_set, first + done), wanted):
                 cases[done + index] = case
                 report(Progress(len(cases), episodes, "case", _shares(cases.values())))
     finally:

@@ -37,7 +37,7 @@ class CasesJob:
     model: str  # a name, or a path in ``out``
     allow_pickle: bool
     task: TaskSettings
-    seed: int  # which set of cases
+    case_set: int
     first: int
     episodes: int
     out: Path
@@ -70,7 +70,7 @@ class CasesJob:
             contender.policy,
             lambda num_envs: contender.make_venv(num_envs, self.task),
             self.episodes,
-            self.seed,
+            self.case_set,
             first=self.first,
             report=report,
         )
@@ -87,7 +87,7 @@ def evaluate_on(
     model: str,
     task: TaskSettings,
     episodes: int,
-    seed: int,
+    case_set: int,
     *,
     allow_pickle: bool = False,
     progress: bool = True,
@@ -98,14 +98,14 @@ def evaluate_on(
         executor: where it is done.
         model, allow_pickle: as in ``load_policy``.
         task: settings of the environments.
-        episodes, seed: number of cases, and which set of cases.
+        episodes, case_set: number of cases, and of their case set.
         progress: show a table on stderr.
 
     Raises:
         InputError: bad values, or a scene that other machines do not have.
         JobError: cases were given up.
     """
-    require_cases(episodes, seed)
+    require_cases(episodes, case_set)
     if task.scene.sumocfg:
         raise InputError("the .sumocfg of a scene is on this machine alone; evaluate here, not on a cluster")
     with tempfile.TemporaryDirectory(prefix="tint_sumo-") as folder:
@@ -114,7 +114,7 @@ def evaluate_on(
         rounds = math.ceil(episodes / (MAX_CASES * executor.slots))  # each gives every slot a job of the same size
         count = BATCH * math.ceil(episodes / (rounds * executor.slots * BATCH))
         jobs = [
-            CasesJob(named, allow_pickle, task, seed, first, min(count, episodes - first), out)
+            CasesJob(named, allow_pickle, task, case_set, first, min(count, episodes - first), out)
             for first in range(0, episodes, count)
         ]
         executor.run(jobs, progress)

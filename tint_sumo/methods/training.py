@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits as trait_models
-from tint_sumo.config import LATENT_SIZE, SNAPSHOTS_PERCENT, Mix, PpoSettings
+from tint_sumo.config import LATENT_SIZE, SEEDS, SNAPSHOTS_PERCENT, Mix, PpoSettings
 from tint_sumo.core.checkpoints import remove_checkpoint, write_checkpoint
 from tint_sumo.core.determinism import preserved_random_state, single_threaded
 from tint_sumo.core.errors import DivergedError, InputError, NotFiniteError
@@ -29,7 +29,7 @@ from tint_sumo.core.training_log import log_film, open_log
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.methods.checkpoint import make_checkpoint, restore_checkpoint
-from tint_sumo.methods.evaluation import CASE_SEED, require_seed
+from tint_sumo.methods.evaluation import CASE_SEED
 from tint_sumo.methods.registry import Learned, find_learned
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
@@ -103,7 +103,7 @@ def train_policy(
     learned = find_learned(method)
     scenes = find_scenes(scene)
     _require_drivers(learned, p_conservative, scenes[0])
-    require_seed(seed)
+    SEEDS.require("seed", seed)
     if steps < 1:
         raise InputError(f"steps must be at least 1, not {steps}")
     if learned.encoder is None and (traits is not None or other_scene):

@@ -14,7 +14,7 @@ from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.scene import SceneSimulation
 
 
-def ceiling(p_conservative: Mix, episodes: int, seed: int = 0, scene: Scene | None = None) -> float:
+def ceiling(p_conservative: Mix, episodes: int, case_set: int = 0, scene: Scene | None = None) -> float:
     """Return the share of the cases in which enough yielding drivers come in time.
 
     A careful ego enters a route only before a driver that yields. It knows all traits, never brakes on its way and
@@ -22,7 +22,7 @@ def ceiling(p_conservative: Mix, episodes: int, seed: int = 0, scene: Scene | No
     takes risks can: it may slip through before an aggressive driver.
 
     Args:
-        p_conservative, episodes, seed: of the cases, see ``tint_sumo.methods.evaluation.evaluate``.
+        p_conservative, episodes, case_set: of the cases, see ``tint_sumo.methods.evaluation.evaluate``.
         scene: where; the paper's if not given.
     """
     played = scene or paper_scene()
@@ -33,7 +33,7 @@ def ceiling(p_conservative: Mix, episodes: int, seed: int = 0, scene: Scene | No
         for first in range(0, episodes, simulation.replicas):
             count = min(simulation.replicas, episodes - first)
             for replica in range(count):
-                rng, _ = seeding.np_random(case_seed(seed, first + replica))
+                rng, _ = seeding.np_random(case_seed(case_set, first + replica))
                 simulation.reset(replica, episode_seed(rng))
             finished += int(_finishes(simulation)[:count].sum())
     finally:

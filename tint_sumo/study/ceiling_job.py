@@ -7,7 +7,7 @@ from tint_sumo.core.files import damaged, read_record, write_json
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Progress, Report
 from tint_sumo.core.reading import RESULT_BYTES
-from tint_sumo.methods.evaluation import CASES
+from tint_sumo.methods.evaluation import REPORTED_SET
 from tint_sumo.scenes import Scene, paper_scene
 from tint_sumo.study.budgets import Trials
 from tint_sumo.study.ceiling import ceiling
@@ -43,7 +43,7 @@ class CeilingJob:
         done, total = 0, sum(wanted.values())
         for mix, episodes in wanted.items():
             report(Progress(done, total, "case"))
-            found[mix.text] = ceiling(mix, episodes, CASES, self.scene)
+            found[mix.text] = ceiling(mix, episodes, REPORTED_SET, self.scene)
             done += episodes
         write_json(self.out / CEILINGS_FILE, found)
         return ", ".join(f"P {p}: {percent(share)}%" for p, share in found.items())

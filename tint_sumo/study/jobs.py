@@ -14,7 +14,7 @@ from tint_sumo.core.progress import Report, part_of
 from tint_sumo.core.reading import RESULT_BYTES, require_file
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
-from tint_sumo.methods.evaluation import CASES, Evaluation, evaluate
+from tint_sumo.methods.evaluation import REPORTED_SET, Evaluation, evaluate
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.registry import METHODS, Rule, find_learned, find_method
 from tint_sumo.methods.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
@@ -103,7 +103,7 @@ class EvaluateJob:
     trials: tuple[Trials, ...]
     out: Path  # folder of the study
     scene: Scene = field(default_factory=paper_scene)
-    cases: int = CASES  # which set of cases
+    case_set: int = REPORTED_SET
 
     uses_gpu = False
 
@@ -149,7 +149,7 @@ class EvaluateJob:
             done += episodes
         origin = GIVEN if self.mix is None else TRAINED
         scene_tau_s = self.scene.tau_s
-        result = Result(self.method, origin, self.mix, self.seed, tuple(tested), self.cases, scene_tau_s)
+        result = Result(self.method, origin, self.mix, self.seed, tuple(tested), self.case_set, scene_tau_s)
         write_json(self.result_file, result.to_json())
         successes = ", ".join(f"{percent(one.evaluation.rate('success').value)}%" for one in tested)
         return f"success {successes}"
@@ -167,7 +167,7 @@ class EvaluateJob:
             contender.policy,
             lambda num_envs: contender.make_venv(num_envs, conditions.task(contender.scene)),
             episodes,
-            self.cases,
+            self.case_set,
             report=report,
         )
 

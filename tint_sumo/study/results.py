@@ -8,10 +8,9 @@ from typing import Annotated, Any, Literal
 from tint_sumo.config import Idm, Mix, NoiseM, Seed, TauS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_record
-from tint_sumo.core.ranges import Range
 from tint_sumo.core.reading import RESULT_BYTES
 from tint_sumo.core.structures import plain
-from tint_sumo.methods.evaluation import CASES, MAX_SEED, Case, Evaluation, StoredCase
+from tint_sumo.methods.evaluation import CASE_SETS, REPORTED_SET, Case, Evaluation, StoredCase
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.folders import RESULTS
 
@@ -35,7 +34,7 @@ class Result:
     mix: Mix | None  # P(conservative) in training; None where the study did not train
     seed: int
     tested: tuple[Measured, ...]
-    case_set: int = CASES
+    case_set: int = REPORTED_SET
     scene_tau_s: float = Idm.tau_s  # headway of the scene's drivers, where conditions give none
 
     def to_json(self) -> dict[str, Any]:
@@ -104,7 +103,7 @@ class _Stored:
     mix: Mix | None
     seed: Seed
     tested: tuple[_StoredTest, ...]
-    case_set: Annotated[int, Range(0, MAX_SEED)] = CASES
+    case_set: Annotated[int, CASE_SETS] = REPORTED_SET
     scene_tau_s: TauS = Idm.tau_s
 
 
@@ -118,6 +117,6 @@ def read_results(out: Path) -> list[Result]:
     if not files:
         raise InputError(f"no results in {out}; run the study first")
     results = [Result.read(file) for file in files]
-    if any(one.case_set != CASES for one in results):
+    if any(one.case_set != REPORTED_SET for one in results):
         raise InputError(f"{out} is part of a sweep, whose cases no study reports; read sweep.md in the folder above")
     return results

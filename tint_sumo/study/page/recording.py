@@ -23,7 +23,7 @@ from tint_sumo.films.driving import Driven, Moment, drive_case
 from tint_sumo.films.trait_probe import TraitReader, fit_reader
 from tint_sumo.jobs import Workers, executor_of
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
-from tint_sumo.methods.evaluation import CASES, CASES_PER_SEED
+from tint_sumo.methods.evaluation import CASES_PER_SET, REPORTED_SET
 from tint_sumo.methods.loading import Contender, find_policy, load_policy
 from tint_sumo.methods.registry import METHODS, Rule
 from tint_sumo.policy.storage import read_policy_card, weights_file
@@ -60,7 +60,7 @@ class _Identity:
     format: int
     policy: str
     conditions: dict[str, Any]
-    cases: tuple[Annotated[int, Range(0, CASES_PER_SEED - 1)], ...]
+    cases: tuple[Annotated[int, Range(0, CASES_PER_SET - 1)], ...]
     scene: dict[str, Any]
 
 
@@ -167,7 +167,7 @@ class Recording:
         episodes = {}
         for done, case in enumerate(self.cases):
             report(Progress(done, len(self.cases), "case"))
-            driven = drive_case(contender, case, CASES, self.conditions.task(contender.scene))
+            driven = drive_case(contender, case, REPORTED_SET, self.conditions.task(contender.scene))
             episodes[str(case)] = encode(driven, reader, routes)
         content = {"recorded": self._identity, "episodes": episodes}
         write_text(self.file, json.dumps(content, separators=(",", ":")))

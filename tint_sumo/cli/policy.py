@@ -120,7 +120,7 @@ class EvaluatePolicy(SpreadCommand):
     episodes: Cases = 500
     """Number of cases."""
     seed: Seed = 0
-    """Number of the set of cases, 0 to 1000."""
+    """Number of the case set, 0 to 1000."""
     allow_pickle: bool = False
     """Read .zip files, which can run any code: for files that you trust alone."""
 

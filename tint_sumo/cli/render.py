@@ -22,7 +22,7 @@ class Render(Command):
     case: Annotated[int, Range(0, 999_999)] = 0
     """Number of the case; the same cases as in policy evaluate."""
     seed: Seed = 0
-    """Number of the set of cases, 0 to 1000."""
+    """Number of the case set, 0 to 1000."""
     scene: TestScene = None
     noise: NoiseM = 0.0
     """Standard deviation of the noise on the others' positions, m; the film shows them without noise."""

@@ -32,7 +32,7 @@ class _Cases:
 
 @dataclass(frozen=True)
 class CasesJob:
-    """Evaluate a policy on the cases ``first``, ``first + 1``, ... of a set of cases."""
+    """Evaluate a policy on the cases ``first``, ``first + 1``, ... of a case set."""
 
     model: str  # a name, or a path in ``out``
     allow_pickle: bool

@@ -95,8 +95,8 @@ class Sweep:
     def _variant(self, values: Sequence[Any]) -> tuple[str, PpoSettings]:
         given = dict(zip(self.varied, values, strict=True))
         network = {name.removeprefix(_NETWORK): one for name, one in given.items() if name.startswith(_NETWORK)}
-        own = {name: one for name, one in given.items() if not name.startswith(_NETWORK)}
-        settings = overlay(self.settings, {**own, "policy": network})
+        direct = {name: value for name, value in given.items() if not name.startswith(_NETWORK)}
+        settings = overlay(self.settings, {**direct, "policy": network})
         return ",".join(f"{name}={_word(attrgetter(name)(settings))}" for name in given), settings
 
     @property

@@ -190,11 +190,11 @@ def _font(size_px: int) -> ImageFont.FreeTypeFont:
 @cache
 def _view(layout: Layout) -> View:
     """Return the scene's view, with more around it where a frame has room."""
-    own = layout.scene.view
-    width_m, height_m = own.right_m - own.left_m, own.top_m - own.bottom_m
+    view = layout.scene.view
+    width_m, height_m = view.right_m - view.left_m, view.top_m - view.bottom_m
     m_per_px = max(width_m / SIZE_PX[0], height_m / _SCENE_HEIGHT_PX)
     half_width_m, half_height_m = SIZE_PX[0] * m_per_px / 2, _SCENE_HEIGHT_PX * m_per_px / 2
-    x_m, y_m = (own.left_m + own.right_m) / 2, (own.bottom_m + own.top_m) / 2
+    x_m, y_m = (view.left_m + view.right_m) / 2, (view.bottom_m + view.top_m) / 2
     return View(x_m - half_width_m, y_m - half_height_m, x_m + half_width_m, y_m + half_height_m)
 
 

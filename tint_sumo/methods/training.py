@@ -166,8 +166,8 @@ def share_training(source: Path, method: str, out: Path, traits: str | Path | No
         save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)).entries)
         for percent in (*SNAPSHOTS_PERCENT, 100):
             stem = snapshot_stem(source, percent)
-            own = {"method": method, "trained_as": learned.trained_as} | _traits_entries(encoder)
-            save_policy(load_policy_network(stem), snapshot_stem(out, percent), {**read_policy_card(stem), **own})
+            entries = {"method": method, "trained_as": learned.trained_as} | _traits_entries(encoder)
+            save_policy(load_policy_network(stem), snapshot_stem(out, percent), {**read_policy_card(stem), **entries})
 
 
 def _require_drivers(learned: Learned, p_conservative: Mix | None, scene: AnyScene) -> None:
@@ -220,8 +220,8 @@ def _learn(
     venv.seed(_training_seed(seed))
     recent = restore_checkpoint(out, model)
     done = model.num_timesteps
-    told = {key: card[key] for key in ("method", "p_conservative", "scene", "seed", "steps", "settings")}
-    model.set_logger(open_log(out, told, [f"rollout/{outcome}" for outcome in OUTCOMES], done))
+    logged = {key: card[key] for key in ("method", "p_conservative", "scene", "seed", "steps", "settings")}
+    model.set_logger(open_log(out, logged, [f"rollout/{outcome}" for outcome in OUTCOMES], done))
     if done < steps:
         report(Progress(done, steps, "step"))
         watch = _Watch(out, steps, card, film, report, recent)

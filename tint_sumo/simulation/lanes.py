@@ -1,4 +1,4 @@
-"""Where vehicles are on their routes, from where SUMO has them on its lanes."""
+"""Positions of vehicles along their routes, from those on SUMO's lanes."""
 
 import numpy as np
 

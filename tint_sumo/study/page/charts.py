@@ -39,22 +39,22 @@ def outcome_chart(rows: Sequence[Summary], outcome: str) -> Chart:
     mixes = sorted({row.conditions.p_conservative for row in rows})
     traces, lines = [], [["method", "P(conservative)", f"{outcome} %", "95 % interval"]]
     for position, mix in enumerate(mixes):
-        own = [row for row in rows if row.conditions.p_conservative == mix]
+        shown_rows = [row for row in rows if row.conditions.p_conservative == mix]
         shift = 0.0 if len(mixes) == 1 else 0.3 * (2 * position / (len(mixes) - 1) - 1)
-        shares, limits = _rates(own, outcome)
-        heights = [titles.index(row.title) + shift for row in own]
+        shares, limits = _rates(shown_rows, outcome)
+        heights = [titles.index(row.title) + shift for row in shown_rows]
         look = Look(_MIX_COLOUR, _MIX_MARKERS[position % len(_MIX_MARKERS)])
         traces.append(
             {
                 **_marks(shares, heights, f"P {mix.low:g}", look),
                 "mode": "markers",
                 "error_x": _errors(shares, limits),
-                "text": [row.title for row in own],
+                "text": [row.title for row in shown_rows],
                 "hovertemplate": "%{text}: %{x:.1f} %<extra>%{fullData.name}</extra>",
             }
         )
-    for title, own in by_title(rows).items():
-        for row in own:
+    for title, shown_rows in by_title(rows).items():
+        for row in shown_rows:
             share, span = percent(row.rate(outcome)), _span(row.intervals[outcome])
             lines.append([title, f"{row.conditions.p_conservative.low:g}", share, span])
     layout = {
@@ -101,13 +101,13 @@ def condition_charts(rows: Sequence[Summary]) -> list[Chart]:
     charts = []
     for name, title in CONDITION_TITLES.items():
         traces, lines = [], [["method", title, "success %", "95 % interval"]]
-        for method, own in by_title(rows).items():
-            look = look_of(own[0].method)
-            points = varied(own, name)
+        for method, shown_rows in by_title(rows).items():
+            look = look_of(shown_rows[0].method)
+            points = varied(shown_rows, name)
             shares, limits = _rates(list(points.values()), "success")
             for value, row in points.items():
                 lines.append([method, f"{value:g}", percent(row.rate("success")), _span(row.intervals["success"])])
-            line = _marks(list(points), shares, method, look, is_open=own[0].is_shipped)
+            line = _marks(list(points), shares, method, look, is_open=shown_rows[0].is_shipped)
             traces.append({**line, "mode": "lines+markers", "line": _line(look), "error_y": _errors(shares, limits)})
         if any(len(trace["x"]) > 1 for trace in traces):
             layout = {

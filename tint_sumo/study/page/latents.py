@@ -65,7 +65,7 @@ def _states(windows: Windows, one: int) -> dict[str, list[int | None]]:
 
 
 def _model(out: Path, name: str, windows: Windows) -> dict[str, Any]:
-    own = out / "traits" / name / "model.safetensors"
-    model = traits.load(own if own.exists() else name, latent_size=LATENT_SIZE)
+    trained = out / "traits" / name / "model.safetensors"
+    model = traits.load(trained if trained.exists() else name, latent_size=LATENT_SIZE)
     latents = encode_windows(model, windows).mean
-    return {"own": own.exists(), "latents": np.round(latents.astype(float), 3).tolist()}
+    return {"is_trained": trained.exists(), "latents": np.round(latents.astype(float), 3).tolist()}

@@ -285,20 +285,20 @@ def _vehicle(
 ) -> dict[str, Any]:
     """The vehicle keeps its slot while it is there."""
     frames, slots = np.nonzero(numbers == number)
-    slot, own = int(slots[0]), [moments[frame] for frame in frames.tolist()]
+    slot, present = int(slots[0]), [moments[frame] for frame in frames.tolist()]
     columns: dict[str, Any] = {
-        **_positions(np.array([moment.boxes[slot] for moment in own])),
-        "brakes": [moment.brakes[slot] for moment in own],
+        **_positions(np.array([moment.boxes[slot] for moment in present])),
+        "brakes": [moment.brakes[slot] for moment in present],
     }
-    if own[0].attention is not None:
-        columns["attention"] = [moment.attention[slot] for moment in own if moment.attention is not None]
+    if present[0].attention is not None:
+        columns["attention"] = [moment.attention[slot] for moment in present if moment.attention is not None]
     if reader is not None:
         columns["p_conservative"] = reader.p_conservative(
-            np.array([moment.observed_traits[slot] for moment in own if moment.observed_traits is not None])
+            np.array([moment.observed_traits[slot] for moment in present if moment.observed_traits is not None])
         )
     return {
         "number": int(number),
-        "trait": int(own[0].traits[slot]),
+        "trait": int(present[0].traits[slot]),
         "first": int(frames[0]),
         **{name: _column(name, values) for name, values in columns.items()},
     }

@@ -15,7 +15,7 @@ class LatentSpace {
   constructor({ traits, step_m: step, step_s, windows, models }) {
     Object.assign(this, { traits, step, step_s, windows, models });
     this.svg = document.querySelector("#space svg");
-    for (const { name, own } of models) byId("model").append(make("option", { value: name }, own ? name : `${name} (shipped)`));
+    for (const { name, is_trained: isTrained } of models) byId("model").append(make("option", { value: name }, isTrained ? name : `${name} (shipped)`));
     byId("model").addEventListener("change", () => this.draw());
     byId("space").addEventListener("keydown", (event) => this.key(event));
     for (const kind of ["pointermove", "click"]) this.svg.addEventListener(kind, (event) => this.point(event));

@@ -22,7 +22,7 @@ from tint_sumo.cli.command_line import parse
 
 ROOT = Path(__file__).parents[1]
 CLUSTER = ROOT / "examples" / "cluster"
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
 
 # Both stand in for SLURM's own commands and note how they were called. This srun has one machine for all nodes.
 SRUN = """#!/usr/bin/env bash

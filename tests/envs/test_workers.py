@@ -21,7 +21,7 @@ from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.envs.vector import SceneVectorEnv
 
-PATIENCE_S = 30.0
+PATIENCE_S = 300.0
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from tint_sumo.jobs.status import Overview, Status, duration
 from tint_sumo.jobs.table import JobTable, Log, one_job, render
 
 TRAIN, OTHER, TRAITS = "train no_labels-P0.1to0.9-seed0", "train ma-P0.4-seed3", "traits vae"
-PATIENCE_S = 60.0
+PATIENCE_S = 300.0
 HIDE, SHOW = "\x1b[?25l", "\x1b[?25h"  # the cursor
 
 

@@ -1,6 +1,7 @@
 """Every format gives the same table of the same traffic, recognised by the file's beginning."""
 
 import gzip
+import re
 import subprocess
 from pathlib import Path
 
@@ -199,3 +200,95 @@ def test_a_format_can_be_named(tmp_path: Path) -> None:
     for name in FORMATS.keys() - {"commonroad"}:
         with pytest.raises(InputError):
             read_tracks(file, name)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_gzipped_files_are_the_same(tmp_path: Path, name: str) -> None:
+    file = FILES[name](tmp_path)
+    packed = file.with_name(f"{file.name}.gz")
+    packed.write_bytes(gzip.compress(file.read_bytes()))
+    pd.testing.assert_frame_equal(read_tracks(packed).table, read_tracks(file).table)
+    packed.write_bytes(packed.read_bytes()[:60])
+    for format_name in (None, name):
+        with pytest.raises(InputError, match=r"is not whole \(Compressed file ended"):
+            read_tracks(packed, format_name)
+
+
+@pytest.mark.parametrize("suffix", [".zip", ".bz2", ".xz", ".zst", ".tar"])
+def test_names_do_not_say_how_a_file_is_packed(tmp_path: Path, suffix: str) -> None:
+    file = interaction(tmp_path)
+    assert len(read_tracks(file.rename(file.with_suffix(suffix))).table) == 2 * len(FRAMES)
+
+
+def test_spaces_and_a_byte_order_mark_do_not_matter(tmp_path: Path) -> None:
+    file = levelx(tmp_path)
+    table = read_tracks(file).table
+    write_text(file, "\ufeff" + file.read_text().replace(",", " , ").replace("\n", "\r\n"))
+    pd.testing.assert_frame_equal(read_tracks(file).table, table)
+
+
+def test_commas_stand_between_thousands_only(tmp_path: Path) -> None:
+    file = ngsim(tmp_path)
+    table = read_tracks(file).table
+    text = file.read_text()
+    write_text(file, re.sub(r"1118846(98\d)(\d00)", r'"1,118,846,\1,\2"', text))
+    pd.testing.assert_frame_equal(read_tracks(file).table, table)
+    write_text(file, text.replace(",1118846980200,", ',"1,5",', 1))
+    with pytest.raises(InputError, match=r"row \d+: .* is '1,5', not a number; correct it"):
+        read_tracks(file)
+
+
+@pytest.mark.parametrize("name", FILES.keys() - {"commonroad"})
+def test_rows_with_too_many_values_are_refused(tmp_path: Path, name: str) -> None:
+    file = FILES[name](tmp_path)
+    header, *lines = file.read_text().splitlines()
+    write_text(file, "\n".join([header, *(f"{line},9" for line in lines)]))
+    with pytest.raises(InputError, match="more values in its rows than names in its first line"):
+        read_tracks(file)
+
+
+def test_files_that_fit_two_formats_need_its_name(tmp_path: Path) -> None:
+    file = interaction(tmp_path)
+    header, *lines = file.read_text().splitlines()
+    both = [f"{header},id,time,xloc-kf,yloc-kf,speed-kf", *(f"{line},1,2,3,4,5" for line in lines)]
+    write_text(file, "\n".join(both))
+    with pytest.raises(InputError, match="choose the `format`: interaction, tgsim"):
+        read_tracks(file)
+    assert read_tracks(file, "interaction").format == "interaction"
+
+
+@pytest.mark.parametrize("rates", ["7,1,0", "7,1,-25", "7,1,nan", "", "7,1,10\n7,1,10"])
+def test_levelx_needs_one_frame_rate(tmp_path: Path, rates: str) -> None:
+    file = levelx(tmp_path)
+    write_text(tmp_path / "07_recordingMeta.csv", "recordingId,locationId,frameRate\n" + rates)
+    with pytest.raises(InputError, match=r"07_recordingMeta\.csv.*(one row, with a frameRate above 0|not a number)"):
+        read_tracks(file)
+
+
+def test_sizes_below_zero_are_refused(tmp_path: Path) -> None:
+    file = levelx(tmp_path)
+    write_text(file, file.read_text().replace("1.8,4.0", "1.8,-4.0", 1))
+    with pytest.raises(InputError, match=r"length_m is -4 for vehicle 1 at 0 s"):
+        read_tracks(file)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"0.1"', '"0"', "timeStepSize is 0, not above 0"),
+        ('"0.1"', '"-0.1"', "timeStepSize is -0.1, not above 0"),
+        ('"1.0"?', '"1.0" encoding="klingon"?', "is not whole XML"),
+        ('"1.0"?', '"1.0" encoding="utf-32"?', "is not whole XML"),
+    ],
+)
+def test_commonroad_without_sense_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    file = commonroad(tmp_path)
+    write_text(file, file.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=message):
+        read_tracks(file)
+
+
+def test_floating_car_data_between_commas_names_the_columns(tmp_path: Path) -> None:
+    write_text(tmp_path / "fcd.csv", "timestep_time,vehicle_x\n0,1\n")
+    with pytest.raises(InputError, match=r"lacks the columns timestep_time, vehicle_id, .*, between semicolons"):
+        read_tracks(tmp_path / "fcd.csv")

@@ -9,7 +9,8 @@ import pytest
 
 from tests.tracks.files import CAR, interaction
 from tint_sumo.cli import main
-from tint_sumo.tracks.inspection import inspect, overlapping, report
+from tint_sumo.core.errors import InputError
+from tint_sumo.tracks.inspection import inspect, overlapping, plot, report
 from tint_sumo.tracks.schema import COLUMNS, Tracks, build_tracks
 
 
@@ -90,6 +91,19 @@ def test_mixed_units_are_named() -> None:
     assert "positions and speeds have other units than the format says" in report(found)
 
 
+def test_speeds_close_to_zero_are_other_units_too() -> None:
+    found = inspect(made(("a", 0.0, 0.0, 0.0, 1e-30), ("a", 1.0, 10.0, 0.0, 1e-30)))
+    assert "vehicles move 1e+31 times as far as their speeds say" in report(found)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_single_row_is_drawn(tmp_path: Path) -> None:
+    found = inspect(made(("a", 0.0, 0.0, 0.0, 1.0)))
+    assert (found.vehicles, found.rows, found.step_s, found.distance_ratio) == (1, 1, 0.0, None)
+    plot(found, tmp_path / "picture.png")
+    assert matplotlib.image.imread(tmp_path / "picture.png").shape[:2] == (720, 1440)
+
+
 def test_the_command_reports_draws_and_prints_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, picture = interaction(tmp_path), tmp_path / "picture.png"
     assert main(["tracks", "inspect", str(file), "--figure", str(picture), "--json"]) == 0
@@ -137,7 +151,10 @@ def test_the_table_is_sorted_and_typed() -> None:
 
 def test_values_without_sense_are_refused() -> None:
     good = ("a", 0.0, 0.0, 0.0, 1.0)
-    with pytest.raises(ValueError, match=r"x_m is no number for vehicle a at 0\.1 s"):
-        made(good, ("a", 0.1, float("nan"), 0.0, 1.0))
+    for value in (float("nan"), float("-inf"), 1e13):
+        with pytest.raises(InputError, match=rf"x_m is {value:g} for vehicle a at 0\.1 s".replace("+", r"\+")):
+            made(good, ("a", 0.1, value, 0.0, 1.0))
+    with pytest.raises(InputError, match="has 2 rows without a vehicle; remove them, or fill them"):
+        made(good, ("", 0.1, 0.0, 0.0, 1.0), ("", 0.2, 0.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="has no vehicles"):
         made()

@@ -9,7 +9,7 @@ import stat
 import zipfile
 import zlib
 from pathlib import Path
-from typing import IO
+from typing import IO, cast
 
 from tint_sumo.core.errors import InputError
 
@@ -97,14 +97,19 @@ def is_gzipped(file: IO[bytes]) -> bool:
     return magic == b"\x1f\x8b"
 
 
+def unpacked(file: IO[bytes]) -> IO[bytes]:
+    """Return the content of a file that was just opened, whether gzipped or not."""
+    return cast("IO[bytes]", gzip.GzipFile(fileobj=file)) if is_gzipped(file) else file
+
+
 def _unpacks_within(file: IO[bytes], most_bytes: int) -> bool:
     """Return whether a gzipped file has no more bytes than allowed; a damaged file is left to its reader."""
-    unpacked = 0
+    read_bytes = 0
     with gzip.GzipFile(fileobj=file) as stream:
         try:
             while chunk := stream.read(_CHUNK_BYTES):
-                unpacked += len(chunk)
-                if unpacked > _most_unpacked(most_bytes, file.tell()):
+                read_bytes += len(chunk)
+                if read_bytes > _most_unpacked(most_bytes, file.tell()):
                     return False
         except (EOFError, OSError, zlib.error):
             pass

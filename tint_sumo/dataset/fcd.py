@@ -18,7 +18,7 @@ from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Literal, cast
+from typing import IO, Any
 from xml.parsers import expat
 
 import numpy as np
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import whole_file
-from tint_sumo.core.reading import TABLE_BYTES, is_gzipped, require_file
+from tint_sumo.core.reading import TABLE_BYTES, require_file, unpacked
 from tint_sumo.dataset.schema import require_table
 from tint_sumo.scenes.geometry import new_boxes, place
 from tint_sumo.scenes.layout import Layout
@@ -174,9 +174,9 @@ def _read_table(file: Path, columns: FcdColumns) -> pd.DataFrame:
         rows = pd.read_parquet(file, columns=list(names), read_dictionary=list(ids))  # ids once each
     else:
         with file.open("rb") as raw:
-            packing: Literal["gzip"] | None = "gzip" if is_gzipped(raw) else None  # pandas knows others, too
-            texts = dict.fromkeys(ids, str)
-            rows = pd.read_csv(raw, sep=";", usecols=list(names), dtype=texts, compression=packing)
+            rows = pd.read_csv(unpacked(raw), sep=";", usecols=names.__contains__, dtype=dict.fromkeys(ids, str))
+        if missing := [name for name in names if name not in rows]:
+            raise InputError(f"{file} lacks the columns {', '.join(missing)}, between semicolons; {_AGAIN}")
     rows = rows.rename(columns=names)[list(names.values())]
     rows = rows[rows["vehicle"].notna()]  # an empty timestep has a row, too
     kinds = {name: "category" if name in ids.values() else "float64" for name in names.values()}
@@ -190,7 +190,7 @@ def _read_table(file: Path, columns: FcdColumns) -> pd.DataFrame:
 def _read_xml(file: Path, columns: FcdColumns) -> pd.DataFrame:
     reader = _XmlReader(file, columns)
     with file.open("rb") as raw:
-        reader.read(cast("IO[bytes]", gzip.GzipFile(fileobj=raw)) if is_gzipped(raw) else raw)
+        reader.read(unpacked(raw))
     return reader.rows()
 
 

@@ -15,31 +15,43 @@ from xml.etree.ElementTree import Element
 import pandas as pd
 
 from tint_sumo.core.errors import InputError
-from tint_sumo.tracks.reading import Head, TrackFormat, register
+from tint_sumo.tracks.reading import Head, TrackFormat, opened, recording_name, register
 from tint_sumo.tracks.schema import UNKNOWN
 
 
 def _read(file: Path) -> Mapping[str, Any]:
     try:
         rows = list(_rows(file))
-    except ElementTree.ParseError as error:
+    except InputError:
+        raise
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the last two are of encodings
         raise InputError(f"{file} is not whole XML ({error}); get it again") from None
     names = ["vehicle", "time_s", "x_m", "y_m", "heading_rad", "speed_mps", "length_m", "width_m", "vehicle_class"]
-    return {"recording": file.stem, **pd.DataFrame(rows, columns=names)}
+    return {"recording": recording_name(file), **pd.DataFrame(rows, columns=names)}
 
 
 def _rows(file: Path) -> Iterator[tuple[Any, ...]]:
     """Yield one row for each state of each dynamic obstacle."""
     step_s = 0.0
-    for event, element in ElementTree.iterparse(file, ("start", "end")):
-        if event == "start":
-            if element.tag == "commonRoad":
-                step_s = _number(element.get("timeStepSize"), file, "timeStepSize")
-            continue
-        if element.tag == "dynamicObstacle" or (element.tag == "obstacle" and element.findtext("role") == "dynamic"):
-            yield from _obstacle_rows(element, step_s, file)
-        if element.tag in ("dynamicObstacle", "obstacle", "lanelet"):
-            element.clear()
+    with opened(file) as content:
+        for event, element in ElementTree.iterparse(content, ("start", "end")):
+            if event == "start":
+                if element.tag == "commonRoad":
+                    step_s = _time_step_s(element, file)
+                continue
+            if element.tag == "dynamicObstacle" or (
+                element.tag == "obstacle" and element.findtext("role") == "dynamic"
+            ):
+                yield from _obstacle_rows(element, step_s, file)
+            if element.tag in ("dynamicObstacle", "obstacle", "lanelet"):
+                element.clear()
+
+
+def _time_step_s(root: Element, file: Path) -> float:
+    step_s = _number(root.get("timeStepSize"), file, "timeStepSize")
+    if step_s <= 0.0:
+        raise InputError(f"{file}: timeStepSize is {step_s:g}, not above 0; get the file again")
+    return step_s
 
 
 def _obstacle_rows(obstacle: Element, step_s: float, file: Path) -> Iterator[tuple[Any, ...]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tint_sumo.config import VehicleShape
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.fcd import POSES, read_fcd
-from tint_sumo.tracks.reading import Head, TrackFormat, register
+from tint_sumo.tracks.reading import Head, TrackFormat, recording_name, register
 
 _SLOW = 1e-3  # positions that change so much less than speeds say are degrees
 _UTM_NORTH, _UTM_SOUTH = 32600, 32700  # EPSG codes of zone 0
@@ -44,7 +44,7 @@ def _columns(file: Path, rows: pd.DataFrame, x_m: NDArray[np.float64], y_m: NDAr
     shape = VehicleShape()
     heading_rad = np.radians(90.0 - rows["angle_deg"].to_numpy())  # SUMO's angle is clockwise from north
     return {
-        "recording": file.name.partition(".")[0],
+        "recording": recording_name(file),
         "vehicle": rows["vehicle"],
         "time_s": rows["time_s"],
         "x_m": x_m - shape.length_m / 2.0 * np.cos(heading_rad),
@@ -81,7 +81,7 @@ def _in_metres(
 
 def _is_fcd(head: Head) -> bool:
     is_table = "timestep_time" in head.text.partition("\n")[0]
-    return "<fcd-export" in head.text or is_table or head.file.name.endswith((".parquet", ".xml.gz"))
+    return "<fcd-export" in head.text or is_table or head.file.suffix == ".parquet"
 
 
 register(TrackFormat("fcd", "SUMO floating-car data", _is_fcd, _read))

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tint_sumo.core.files import whole_file
-from tint_sumo.core.percentages import percent
 from tint_sumo.tracks.schema import Tracks
 
 MOST_ACCELERATION_MPS2 = 10.0  # cars brake with at most 9 to 10 m/s2 on dry roads
@@ -198,7 +197,7 @@ def report(found: Inspection) -> str:
     ]
     if found.has_mixed_units and found.distance_ratio is not None:
         lines.append(
-            f"units             vehicles move {percent(found.distance_ratio, 3)}% of what their speeds say: positions "
+            f"units             vehicles move {found.distance_ratio:.3g} times as far as their speeds say: positions "
             "and speeds have other units than the format says"
         )
     return "\n".join(lines)
@@ -242,7 +241,9 @@ def plot(found: Inspection, file: Path) -> None:
     speed.set(xlabel="speed (m/s)", ylabel="rows")
     bound = MOST_ACCELERATION_MPS2
     acceleration.hist(np.clip(steps.acceleration_mps2, -bound, bound), bins=80, range=(-bound, bound), color="#4878a8")
-    acceleration.set(xlabel=f"acceleration (m/s², cut at {bound:g})", ylabel="rows", yscale="log")
+    acceleration.set(xlabel=f"acceleration (m/s², cut at {bound:g})", ylabel="rows")
+    if len(steps.row):
+        acceleration.set_yscale("log")
     figure.suptitle(f"{found.vehicles:,} vehicles, {found.rows:,} rows ({found.tracks.format})")
     with whole_file(file) as partial:
         figure.savefig(partial, format=file.suffix.lower().removeprefix("."))

@@ -13,23 +13,28 @@ import numpy as np
 import pandas as pd
 
 from tint_sumo.core.errors import InputError
-from tint_sumo.tracks.reading import Head, TrackFormat, read_csv, register
+from tint_sumo.tracks.reading import Head, TrackFormat, read_csv, recording_name, register
 
 _TRACKS = "_tracks"
 
 
 def _beside(file: Path, part: str) -> Path:
     """Return the file of meta data that goes with a file of tracks."""
-    if not file.stem.endswith(_TRACKS):
+    name = recording_name(file)
+    if not name.endswith(_TRACKS):
         raise InputError(f"{file} must be called NN_tracks.csv, as levelX names it, to find its meta data")
-    found = file.with_name(file.stem.removesuffix(_TRACKS) + f"_{part}.csv")
+    found = file.with_name(name.removesuffix(_TRACKS) + f"_{part}.csv")
     if not found.is_file():
         raise InputError(f"{file} needs {found.name} in its folder, and it is not there; copy it from the dataset")
     return found
 
 
 def _frame_rate_hz(file: Path) -> float:
-    return float(read_csv(_beside(file, "recordingMeta"), ["frameRate"])["frameRate"].iloc[0])
+    meta = _beside(file, "recordingMeta")
+    rates_hz = read_csv(meta, ["frameRate"])["frameRate"]
+    if len(rates_hz) != 1 or rates_hz[0] <= 0.0:
+        raise InputError(f"{meta} must have one row, with a frameRate above 0; copy it from the dataset")
+    return float(rates_hz[0])
 
 
 def _classes(file: Path, ids: pd.Series, id_name: str) -> pd.Series:
@@ -47,15 +52,15 @@ def _read_boxes(file: Path) -> Mapping[str, Any]:
     numbers = ["frame", "xCenter", "yCenter", "heading", "width", "length", "xVelocity", "yVelocity"]
     rows = read_csv(file, numbers, ["trackId"])
     return {
-        "recording": file.stem.removesuffix(_TRACKS),
+        "recording": recording_name(file).removesuffix(_TRACKS),
         "vehicle": rows["trackId"],
         "time_s": rows["frame"] / _frame_rate_hz(file),
         "x_m": rows["xCenter"],
         "y_m": rows["yCenter"],
         "heading_rad": np.radians(rows["heading"]),
         "speed_mps": np.hypot(rows["xVelocity"], rows["yVelocity"]),
-        "length_m": rows["length"].where(rows["length"] > 0.0, 0.5),
-        "width_m": rows["width"].where(rows["width"] > 0.0, 0.5),
+        "length_m": rows["length"].where(rows["length"] != 0.0, 0.5),
+        "width_m": rows["width"].where(rows["width"] != 0.0, 0.5),
         "vehicle_class": _classes(file, rows["trackId"], "trackId"),
     }
 
@@ -64,7 +69,7 @@ def _read_highd(file: Path) -> Mapping[str, Any]:
     """Read highD: x and y are the upper left corner of a box in an image, so y is turned; width is along x."""
     rows = read_csv(file, ["frame", "x", "y", "width", "height", "xVelocity", "yVelocity"], ["id"])
     return {
-        "recording": file.stem.removesuffix(_TRACKS),
+        "recording": recording_name(file).removesuffix(_TRACKS),
         "vehicle": rows["id"],
         "time_s": rows["frame"] / _frame_rate_hz(file),
         "x_m": rows["x"] + rows["width"] / 2.0,

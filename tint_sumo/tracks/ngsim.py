@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tint_sumo.tracks.reading import Head, TrackFormat, read_columns_of, read_csv, register
+from tint_sumo.tracks.reading import Head, TrackFormat, read_columns_of, read_csv, recording_name, register
 from tint_sumo.tracks.schema import headings_of_motion
 
 _FOOT_M = 0.3048
@@ -27,7 +27,7 @@ def _read_ngsim(file: Path) -> Mapping[str, Any]:
     is_joined = "location" in read_columns_of(file)
     texts = ["Vehicle_ID", "Total_Frames", "v_Class", *(["Location"] if is_joined else [])]
     rows = read_csv(file, _NGSIM_NUMBERS, texts)
-    recording = rows["Location"] if is_joined else pd.Series(file.stem, rows.index)
+    recording = rows["Location"] if is_joined else pd.Series(recording_name(file), rows.index)
     vehicle = rows["Vehicle_ID"] + "-" + rows["Total_Frames"]
     start_ms = rows["Global_Time"].groupby(recording).transform("min")
     time_s = (rows["Global_Time"] - start_ms) / 1000.0
@@ -51,7 +51,7 @@ def _read_ngsim(file: Path) -> Mapping[str, Any]:
 def _read_tgsim(file: Path) -> Mapping[str, Any]:
     has_runs = "run-index" in read_columns_of(file)
     rows = read_csv(file, _TGSIM_NUMBERS, ["id", "type-most-common", *(["run-index"] if has_runs else [])])
-    recording = rows["run-index"] if has_runs else pd.Series(file.stem, rows.index)
+    recording = rows["run-index"] if has_runs else pd.Series(recording_name(file), rows.index)
     x_m, y_m = rows["xloc-kf"], -rows["yloc-kf"]
     return {
         "recording": recording,

@@ -1,19 +1,22 @@
 """Finds the format of a file and reads its tracks. Each format is one module, imported in ``tint_sumo.tracks``."""
 
-from collections.abc import Callable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pandas as pd
 
 from tint_sumo.core.errors import InputError, find_named
-from tint_sumo.core.reading import TABLE_BYTES, open_file, require_file
+from tint_sumo.core.reading import TABLE_BYTES, open_file, require_file, unpacked
 from tint_sumo.tracks.schema import Tracks, build_tracks
 
 _HEAD_BYTES = 4096  # of a file, from which its format is recognised
 _ROLE = "tracks"
+_THOUSANDS = r"-?\d{1,3}(,\d{3})+(\.\d*)?"  # a comma before other digits may be a decimal one
 
 
 @dataclass(frozen=True)
@@ -62,24 +65,49 @@ def read_tracks(file: Path, format_name: str | None = None) -> Tracks:
         format_name: the format; recognised by the file's beginning if not given.
 
     Raises:
-        InputError: there is no such file, its format is not known, it is damaged, or values are missing, not finite or
-            given twice.
+        InputError: there is no such file, its format is not known or not the only one that fits, it is damaged, or
+            values are missing, not finite or given twice.
     """
     head = _head(file)
     if format_name is None:
-        found = next((one for one in FORMATS.values() if one.recognises(head)), None)
-        if found is None:
-            known = "; ".join(one.title for one in FORMATS.values())
-            raise InputError(f"{file} has the columns or elements of no known format of tracks: {known}")
+        fitting = [track_format for track_format in FORMATS.values() if track_format.recognises(head)]
+        if not fitting:
+            known = "; ".join(track_format.title for track_format in FORMATS.values())
+            raise InputError(
+                f"{file} has the columns or elements of no known format of tracks; give a file of one of these: {known}"
+            )
+        if len(fitting) > 1:
+            names = ", ".join(track_format.name for track_format in fitting)
+            raise InputError(f"{file} fits more than one format of tracks; choose the `format`: {names}")
+        found = fitting[0]
     else:
-        found = FORMATS[find_named("format", format_name, {name: name for name in FORMATS})]
+        found = find_named("format", format_name, FORMATS)
     require_file(file, _ROLE, TABLE_BYTES)
     return build_tracks(file, found.name, found.read(file))
 
 
+@contextmanager
+def opened(file: Path) -> Iterator[IO[bytes]]:
+    """Open a file of tracks, gzipped or not.
+
+    Raises:
+        InputError: there is no such file, or it is damaged.
+    """
+    try:
+        with open_file(file, _ROLE, TABLE_BYTES) as raw:
+            yield unpacked(raw)
+    except (EOFError, OSError, zlib.error) as error:
+        raise InputError(f"{file} is not whole ({error}); get it again") from None
+
+
+def recording_name(file: Path) -> str:
+    """Return the name of a file without its suffix, and without .gz behind that."""
+    return Path(file.name.removesuffix(".gz")).stem
+
+
 def _head(file: Path) -> Head:
-    with open_file(file, _ROLE, TABLE_BYTES) as opened:
-        return Head(file, opened.read(_HEAD_BYTES).decode("utf-8", "replace"))
+    with opened(file) as content:
+        return Head(file, content.read(_HEAD_BYTES).decode("utf-8", "replace"))
 
 
 def read_columns_of(file: Path) -> frozenset[str]:
@@ -97,7 +125,7 @@ def read_csv(file: Path, numbers: Sequence[str], texts: Sequence[str] = ()) -> p
     Args:
         file: CSV file with a header line.
         numbers: names of columns with numbers.
-        texts: names of columns with texts or ids, kept as they are written.
+        texts: names of columns with texts or ids, kept as they are written but for spaces around them.
 
     Returns:
         these columns, called as they were asked for.
@@ -106,20 +134,32 @@ def read_csv(file: Path, numbers: Sequence[str], texts: Sequence[str] = ()) -> p
         InputError: the file is damaged, has no rows, lacks columns, or holds something else where a number belongs.
     """
     try:
-        rows = pd.read_csv(file, dtype=str, encoding="utf-8-sig", skipinitialspace=True, na_filter=False)
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError, EOFError, OSError) as error:
+        with opened(file) as content:
+            rows = pd.read_csv(content, dtype=str, encoding="utf-8-sig", skipinitialspace=True, na_filter=False)
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise InputError(f"{file} is not a whole CSV file ({' '.join(str(error).split())}); get it again") from None
-    names = {str(name).strip().lower(): name for name in rows.columns}
+    if not isinstance(rows.index, pd.RangeIndex):  # pandas takes the first values for names of rows
+        raise InputError(f"{file} has more values in its rows than names in its first line; add the missing names")
+    names = {str(name).strip().lower(): name for name in reversed(rows.columns)}  # the first of those that are twice
     wanted = [*numbers, *texts]
     missing = [name for name in wanted if name.lower() not in names]
     if missing:
         raise InputError(f"{file} lacks the column {', '.join(missing)}; give the file as it was published")
-    table = pd.DataFrame({name: rows[names[name.lower()]] for name in wanted})
+    table = pd.DataFrame({name: rows[names[name.lower()]].str.strip() for name in wanted})
     for name in numbers:
-        values = pd.to_numeric(table[name].str.replace(",", "", regex=False), errors="coerce")
-        bad = np.flatnonzero(values.isna().to_numpy())
-        if len(bad):
-            found = table[name].iloc[bad[0]]
-            raise InputError(f"{file}, line {bad[0] + 2}: {name} is {found!r}, not a number; mend it")
-        table[name] = values
+        table[name] = _numbers(file, table[name])
     return table
+
+
+def _numbers(file: Path, texts: pd.Series) -> pd.Series:
+    """Return the numbers of a column, whose thousands may stand between commas."""
+    values = pd.to_numeric(texts, errors="coerce")
+    unread = values.isna()
+    if unread.any():
+        grouped = texts[unread].where(texts[unread].str.fullmatch(_THOUSANDS), "")
+        values[unread] = pd.to_numeric(grouped.str.replace(",", ""), errors="coerce")
+    bad = np.flatnonzero(values.isna().to_numpy())
+    if len(bad):
+        found = texts.iloc[bad[0]]
+        raise InputError(f"{file}, row {bad[0] + 1}: {texts.name} is {found!r}, not a number; correct it")
+    return values

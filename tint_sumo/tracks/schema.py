@@ -44,6 +44,7 @@ KEYS = ["recording", "vehicle", "time_s"]
 _TEXTS = [field.name for field in TRACK_SCHEMA if pa.types.is_dictionary(field.type)]
 _NUMBERS = [name for name in COLUMNS if name not in _TEXTS]
 UNKNOWN = "unknown"  # class of vehicles where a file names none
+_MOST = 1e12  # of any number: beyond all times since 1970 in seconds, and all positions on Earth in metres
 MOVED_M = 0.5  # a heading is derived from positions that lie so far apart, or it would follow the noise
 
 
@@ -74,22 +75,25 @@ def build_tracks(file: Path, format_name: str, columns: Mapping[str, Any]) -> Tr
         columns: values by the names of ``TRACK_SCHEMA``; single ones stand for all rows.
 
     Raises:
-        InputError: there is no vehicle, a value is missing or not finite, a box has no size, or a vehicle is twice at
-            one time.
+        InputError: there is no vehicle, a value is missing, not finite or absurdly large, a box has no size, or a
+            vehicle is twice at one time.
     """
     table = pd.DataFrame({name: columns[name] for name in COLUMNS})
     if table.empty:
         raise InputError(f"{file} has no vehicles; give a recording of traffic")
     table[_NUMBERS] = table[_NUMBERS].astype("float64")
     table[_TEXTS] = table[_TEXTS].astype(str).astype("category")
+    for name in ("recording", "vehicle"):
+        if "" in table[name].cat.categories:
+            raise InputError(f"{file} has {sum(table[name] == ''):,} rows without a {name}; remove them, or fill them")
     for name in _NUMBERS:
-        bad = ~np.isfinite(table[name].to_numpy())
+        values = table[name].to_numpy()
+        bad = ~(np.abs(values) <= _MOST)  # NaN, too
+        if name in ("length_m", "width_m"):
+            bad |= values <= 0.0
         if bad.any():
-            raise InputError(f"{file}: {name} is no number for {_first(table, bad)}; remove such rows, or fill them")
-    for name in ("length_m", "width_m"):
-        bad = table[name].to_numpy() <= 0.0
-        if bad.any():
-            raise InputError(f"{file}: {name} is not above 0 for {_first(table, bad)}; remove such rows, or correct it")
+            problem = f"{name} is {values[bad][0]:g} for {_first(table, bad)}"
+            raise InputError(f"{file}: {problem}; remove such rows, or correct them")
     table["speed_mps"] = table["speed_mps"].abs()
     table["heading_rad"] = (table["heading_rad"] + np.pi) % (2.0 * np.pi) - np.pi
     table = table.sort_values(KEYS, kind="stable", ignore_index=True)
@@ -105,7 +109,7 @@ def build_tracks(file: Path, format_name: str, columns: Mapping[str, Any]) -> Tr
 def _first(table: pd.DataFrame, rows: NDArray[np.bool_]) -> str:
     """Return vehicle and time of the first of some rows, for messages."""
     row = table.iloc[int(np.flatnonzero(rows)[0])]
-    return f"vehicle {row['vehicle']} at {row['time_s']:g} s"
+    return f"vehicle {row['vehicle']} at {row['time_s']:.10g} s"
 
 
 def headings_of_motion(

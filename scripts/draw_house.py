@@ -25,9 +25,9 @@ def floors() -> list[list[str]]:
 def imports() -> set[tuple[str, str]]:
     """Return pairs of packages, of which the first imports the second."""
     graph = grimp.build_graph(PACKAGE)
-    pairs = {(one, other) for one in graph.modules for other in graph.find_modules_directly_imported_by(one)}
-    named = {(one.split(".")[1], other.split(".")[1]) for one, other in pairs if "." in one and "." in other}
-    return {(one, other) for one, other in named if one != other}
+    pairs = [(module, used) for module in graph.modules for used in graph.find_modules_directly_imported_by(module)]
+    packages = {(module.split(".")[1], used.split(".")[1]) for module, used in pairs if "." in module and "." in used}
+    return {(package, used) for package, used in packages if package != used}
 
 
 def draw(floors: list[list[str]], imports: set[tuple[str, str]]) -> str:

@@ -125,11 +125,11 @@ def make_pictures(images: Path) -> None:
     Image.fromarray(pictures[T_INTERSECTION]).save(images / "scene.png", optimize=True)
     titled = [titled_picture(name, picture) for name, picture in pictures.items()]
     rows = [titled[:3], titled[3:]]
-    width, heights = titled[0].width + 8, [max(one.height for one in row) + 8 for row in rows]
+    width, heights = titled[0].width + 8, [max(picture.height for picture in row) + 8 for row in rows]
     sheet = Image.new("RGB", (3 * width, sum(heights)), "white")
     for number, row in enumerate(rows):
-        for column, one in enumerate(row):
-            sheet.paste(one, (column * width, sum(heights[:number])))
+        for column, picture in enumerate(row):
+            sheet.paste(picture, (column * width, sum(heights[:number])))
     sheet.save(images / "scenes.png", optimize=True)
 
 

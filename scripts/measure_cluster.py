@@ -69,7 +69,7 @@ def main() -> None:
         runs = [times_s(nodes) for _ in range(REPEATS)]
         medians_s = [median(of_kind) for of_kind in zip(*runs, strict=True)]
         alone = alone or medians_s
-        shares = [one / (nodes * spent) for one, spent in zip(alone, medians_s, strict=True)]
+        shares = [alone_s / (nodes * spent) for alone_s, spent in zip(alone, medians_s, strict=True)]
         columns = "".join(f"  {took:7.1f} s  {share:10.0%}" for took, share in zip(medians_s, shares, strict=True))
         print(f"{nodes:5}{columns}  {runs}", flush=True)
 

@@ -98,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for tally in tallies:
         print(tally.line)
     for tally in tallies:
-        print("".join(f"\n{tally.module} survives:\n{one}\n" for one in tally.survivors), end="")
+        print("".join(f"\n{tally.module} survives:\n{survivor}\n" for survivor in tally.survivors), end="")
     return 0
 
 
@@ -133,8 +133,9 @@ def _break_module(name: str, tree: Path, arguments: argparse.Namespace, end_s: f
         count = min(len(mutants), arguments.sample or len(mutants))
         chosen = random.Random(SEED).sample(mutants, count)
         results = dict(db.results)
-        settled = {job for job, one in results.items() if not arguments.again or one.test_outcome == TestOutcome.KILLED}
-        waiting = [one for one in chosen if one.job_id not in settled]
+        killed = {job for job, result in results.items() if result.test_outcome == TestOutcome.KILLED}
+        settled = killed if arguments.again else results.keys()
+        waiting = [mutant for mutant in chosen if mutant.job_id not in settled]
         if waiting and time.monotonic() < end_s:
             numba.config.DISABLE_JIT = "@compiled" in source  # type: ignore[attr-defined]
             limit_s = SLOWEST_S + 3.0 * _prepare(tests)
@@ -144,7 +145,7 @@ def _break_module(name: str, tree: Path, arguments: argparse.Namespace, end_s: f
                 results[item.job_id] = _try(db, item, file, tests, limit_s)
                 print(f"\r{name}: {number + 1} of {len(waiting)} mutants", end="", file=sys.stderr, flush=True)
             print(file=sys.stderr)
-    return _tally(name, len(mutants), [results[one.job_id] for one in chosen if one.job_id in results])
+    return _tally(name, len(mutants), [results[mutant.job_id] for mutant in chosen if mutant.job_id in results])
 
 
 def _prepare(tests: Sequence[str]) -> float:
@@ -257,10 +258,10 @@ def _kill_group(process: int) -> None:
 
 def _tally(name: str, mutants: int, results: Sequence[WorkResult]) -> Tally:
     listed = tomllib.loads(EQUIVALENT.read_text(encoding="utf-8"))["equivalent"]
-    same = {f"- {one['was']}\n+ {one['now']}" for one in listed if one["module"] == name}
-    outcomes = Counter(one.test_outcome for one in results)
-    survived = [one.diff or "" for one in results if one.test_outcome == TestOutcome.SURVIVED]
-    survivors = tuple(one for one in survived if one not in same)
+    same = {f"- {known['was']}\n+ {known['now']}" for known in listed if known["module"] == name}
+    outcomes = Counter(result.test_outcome for result in results)
+    survived = [result.diff or "" for result in results if result.test_outcome == TestOutcome.SURVIVED]
+    survivors = tuple(survivor for survivor in survived if survivor not in same)
     return Tally(name, mutants, outcomes[TestOutcome.KILLED], len(survived) - len(survivors), survivors)
 
 

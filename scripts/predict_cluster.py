@@ -78,7 +78,7 @@ class Schedule:
 
 
 def measure() -> Times:
-    learned = [one.name for one in METHODS.values() if isinstance(one, Learned) and one.trained_as is None]
+    learned = [method.name for method in METHODS.values() if isinstance(method, Learned) and method.trained_as is None]
     decision_s = {}
     for method in learned:
         short_s, long_s = (_job_s(_training(method, rollouts)) for rollouts in (1, 1 + ROLLOUTS))

@@ -186,7 +186,7 @@ class Mix(FileForm):
         if isinstance(value, cls):
             return value
         numbers = value if isinstance(value, list | tuple) else [value]
-        are_numbers = all(isinstance(one, Real) and not isinstance(one, bool) for one in numbers)
+        are_numbers = all(isinstance(number, Real) and not isinstance(number, bool) for number in numbers)
         if not are_numbers or len(numbers) not in (1, 2):
             raise InputError(f"P(conservative) must be {cls.form}, not {shown(value)}")
         return cls(*numbers)

@@ -136,7 +136,7 @@ class Benchmark:
             ("Stable-Baselines3 environment", f"{self.env_steps_per_s:,.0f} environment steps/s"),
             ("  its speed to SUMO's alone", f"{self.env_to_floor:.2f}"),
             ("  and with its collision check", f"{self.env_to_checking_floor:.2f}"),
-            *((f"  {scene} to t_intersection", f"{one:.2f}") for scene, one in self.scenes_to_t_intersection.items()),
+            *((f"  {name} to t_intersection", f"{ratio:.2f}") for name, ratio in self.scenes_to_t_intersection.items()),
             ("one gymnasium environment", f"{self.gym_env_steps_per_s:,.0f} steps/s"),
             *(row for cores in self.cores for row in cores.rows()),
             (f"recorder, {_RECORD_WORKERS} workers", f"{self.record_windows_per_s:,.0f} windows/s"),
@@ -247,7 +247,7 @@ def _scenes(sizes: Sizes) -> dict[str, Any]:
     paper = speeds.pop(T_INTERSECTION)
     return {
         "scenes_to_t_intersection": {
-            scene: median(one / other for one, other in zip(found, paper, strict=True))
+            scene: median(speed / other for speed, other in zip(found, paper, strict=True))
             for scene, found in speeds.items()
         }
     }
@@ -316,8 +316,8 @@ def _cores(sizes: Sizes) -> dict[str, Any]:
 
 def _workers_speed(sizes: Sizes) -> Cores:
     """Measure in turns, each in another process."""
-    with turns_apart(_driven_turns, sizes, 1) as one, turns_apart(_driven_turns, sizes, 2) as two:
-        speeds = [(one(), two()) for _ in range(_CORES_TURNS * sizes.turns)]
+    with turns_apart(_driven_turns, sizes, 1) as single, turns_apart(_driven_turns, sizes, 2) as double:
+        speeds = [(single(), double()) for _ in range(_CORES_TURNS * sizes.turns)]
     ratio = median(b / a for a, b in speeds)
     return Cores(sizes.replicas, median(a for a, _ in speeds), median(b for _, b in speeds), ratio)
 

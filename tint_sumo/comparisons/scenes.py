@@ -213,9 +213,9 @@ class _Transfer:
 def _report(out: Path) -> pd.DataFrame:
     files = sorted((out / RESULTS).glob("*.json"))
     found = [read_record(file, "result of the study", _Transfer, RESULT_BYTES) for file in files]
-    rows = [(one, asdict(row)) for one in found for row in one.scenes]
+    rows = [(result, asdict(row)) for result in found for row in result.scenes]
     table = pd.DataFrame(
-        [{"method": one.method, "trained_on": one.trained_on, "seed": one.seed, **row} for one, row in rows]
+        [{"method": result.method, "trained_on": result.trained_on, "seed": result.seed, **row} for result, row in rows]
     )
     write_text(out / "scenes.csv", table.to_csv(index=False))
     write_text(out / "scenes.md", report_markdown(table))

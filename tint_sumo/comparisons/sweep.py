@@ -39,8 +39,8 @@ MAX_NAME = 150  # characters of a variant's name: it is part of the names of fil
 _NETWORK = "policy."
 _ATTENTION = "policy.attention"
 SETTINGS = (
-    *(one.name for one in fields(PpoSettings) if one.name != "policy"),
-    *(name for one in fields(PolicySettings) if (name := _NETWORK + one.name) != _ATTENTION),
+    *(setting.name for setting in fields(PpoSettings) if setting.name != "policy"),
+    *(name for setting in fields(PolicySettings) if (name := _NETWORK + setting.name) != _ATTENTION),
 )
 
 
@@ -81,7 +81,7 @@ class Sweep:
             if not values:
                 raise InputError(f"{name} needs a value; give one or more, as {name}=VALUE,VALUE")
         for name, values in self.varied.items():
-            if len({attrgetter(name)(one) for one in self.variants.values()}) < len(values):
+            if len({attrgetter(name)(settings) for settings in self.variants.values()}) < len(values):
                 raise InputError(f"{name} must have each value once, not {', '.join(map(str, values))}")
         longest = max(map(len, self.variants))
         if longest > MAX_NAME:
@@ -94,7 +94,7 @@ class Sweep:
 
     def _variant(self, values: Sequence[Any]) -> tuple[str, PpoSettings]:
         given = dict(zip(self.varied, values, strict=True))
-        network = {name.removeprefix(_NETWORK): one for name, one in given.items() if name.startswith(_NETWORK)}
+        network = {name.removeprefix(_NETWORK): value for name, value in given.items() if name.startswith(_NETWORK)}
         direct = {name: value for name, value in given.items() if not name.startswith(_NETWORK)}
         settings = overlay(self.settings, {**direct, "policy": network})
         return ",".join(f"{name}={_word(attrgetter(name)(settings))}" for name in given), settings
@@ -224,15 +224,15 @@ def _read_table(tests: Sequence[VariantJob]) -> pd.DataFrame:
     for job in tests:
         assert isinstance(job.placed, EvaluateJob)
         result = Result.read(job.placed.result_file)
-        for one in result.tested:
+        for tested in result.tested:
             rows.append(
                 {
                     "variant": job.variant,
                     "method": result.method,
                     "seed": result.seed,
-                    "p_conservative": one.conditions.p_conservative.low,
-                    **{outcome: one.evaluation.rate(outcome).value for outcome in OUTCOMES},
-                    "navigation_time_s": one.evaluation.navigation_time_s,
+                    "p_conservative": tested.conditions.p_conservative.low,
+                    **{outcome: tested.evaluation.rate(outcome).value for outcome in OUTCOMES},
+                    "navigation_time_s": tested.evaluation.navigation_time_s,
                 }
             )
     return pd.DataFrame(rows).astype({"navigation_time_s": float})
@@ -251,7 +251,7 @@ def report_markdown(table: pd.DataFrame, episodes: int) -> str:
 def _lines(table: pd.DataFrame) -> Lines:
     mixes = sorted(table["p_conservative"].unique())
     found = [(keys, rows) for keys, rows in table.groupby(["variant", "method"], sort=False)]
-    found.sort(key=lambda one: -one[1]["success"].mean())
+    found.sort(key=lambda item: -item[1]["success"].mean())
     lines = [["settings", "method", *(f"P {p:g}" for p in mixes), "mean"]]
     for (variant, method), rows in found:
         cells = [_with_spread(rows.loc[rows["p_conservative"] == p, "success"]) for p in mixes]
@@ -268,7 +268,7 @@ def _require_traits(methods: Sequence[Learned], scene: Scene) -> None:
     """Raise InputError unless there are trait models for these methods in this scene."""
     inferring = [method.name for method in methods if method.encoder]
     if inferring and scene.digest != paper_scene().digest:
-        others = [one.name for one in METHODS.values() if isinstance(one, Learned) and not one.encoder]
+        others = [method.name for method in METHODS.values() if isinstance(method, Learned) and not method.encoder]
         raise InputError(
             f"{', '.join(inferring)}: the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; "
             f"choose methods without one: {', '.join(others)}"

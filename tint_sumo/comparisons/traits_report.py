@@ -120,7 +120,7 @@ def aggregate(seeds: pd.DataFrame) -> pd.DataFrame:
     spread = groups.std(numeric_only=True).drop(columns=["seed", "windows", "training_windows", "training_s"])
     joined = mean.join(spread.add_suffix("_sd"))
     joined.insert(0, "seeds", groups["seed"].count())
-    columns = ["seeds", *(name for one in mean.columns for name in (one, f"{one}_sd") if name in joined)]
+    columns = ["seeds", *(name for column in mean.columns for name in (column, f"{column}_sd") if name in joined)]
     return joined[columns].reset_index()
 
 

@@ -40,7 +40,7 @@ class GymnasiumVectorEnv(SceneVectorEnv):
         _require_known(GymnasiumVectorEnv, task)
         scenes = task.get("scene")
         if isinstance(scenes, list | tuple):
-            each = [TaskSettings(**{**task, "scene": one}) for one in scenes]
+            each = [TaskSettings(**{**task, "scene": scene}) for scene in scenes]
             super().__init__(num_envs, each, render_mode, workers, autoreset_mode)
         else:
             super().__init__(num_envs, TaskSettings(**task), render_mode, workers, autoreset_mode)
@@ -48,5 +48,6 @@ class GymnasiumVectorEnv(SceneVectorEnv):
 
 def _require_known(entry_point: type, task: Mapping[str, Any]) -> None:
     """Raise InputError if neither an entry point nor ``TaskSettings`` has an argument of this name."""
-    named = [one.name for one in signature(entry_point).parameters.values() if one.kind is not one.VAR_KEYWORD]
+    arguments = signature(entry_point).parameters.values()
+    named = [argument.name for argument in arguments if argument.kind is not argument.VAR_KEYWORD]
     require_fields(task, dict.fromkeys([*named, *(field.name for field in fields(TaskSettings))]))

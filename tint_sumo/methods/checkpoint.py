@@ -90,16 +90,16 @@ def make_checkpoint(model: RecurrentPPO, recent: Iterable[str]) -> bytes:
         **_shown(model),
         **_memory(there),
         _GENERATOR: torch.get_rng_state(),
-        _ACTIONS: torch.tensor([action for one in there.episodes for action in one.actions], dtype=torch.int8),
-        _COUNTS: torch.tensor([len(one.actions) for one in there.episodes]),
+        _ACTIONS: torch.tensor([action for episode in there.episodes for action in episode.actions], dtype=torch.int8),
+        _COUNTS: torch.tensor([len(episode.actions) for episode in there.episodes]),
     }
     state = _State(
         model.num_timesteps,
         model._n_updates,
         tuple(recent),
-        tuple(_EpisodeInfo(float(one["r"]), int(one["l"]), float(one["t"])) for one in model.ep_info_buffer),
-        tuple(bool(one) for one in model.ep_success_buffer),
-        tuple(_Pcg64.of(one.began) for one in there.episodes),
+        tuple(_EpisodeInfo(float(info["r"]), int(info["l"]), float(info["t"])) for info in model.ep_info_buffer),
+        tuple(bool(success) for success in model.ep_success_buffer),
+        tuple(_Pcg64.of(episode.began) for episode in there.episodes),
     )
     return pack(tensors, state)
 

@@ -79,7 +79,7 @@ class CasesJob:
 
     def cases(self) -> tuple[Case, ...]:
         """Return the cases that the job has written."""
-        return tuple(Case(*one) for one in read_record(self.file, "cases", _Cases, RESULT_BYTES).cases)
+        return tuple(Case(*values) for values in read_record(self.file, "cases", _Cases, RESULT_BYTES).cases)
 
 
 def evaluate_on(

@@ -79,8 +79,8 @@ def load_policy(
     given = None if scene is None else find_scene(scene)
     method = METHODS.get(str(name_or_path))
     if isinstance(method, Rule):
-        place = given or paper_scene()
-        return _in_scene(Contender(method.name, method.make(place), place, method=method.name), place)
+        chosen = given or paper_scene()
+        return _in_scene(Contender(method.name, method.make(chosen), chosen, method=method.name), chosen)
     if Path(name_or_path).suffix == ".zip":
         stem = Path(name_or_path).with_suffix("")
         found = _contender(stem, _load_zip(Path(name_or_path), allow_pickle))

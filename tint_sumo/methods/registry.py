@@ -158,8 +158,8 @@ def look_of(name: str) -> Look:
 
 def look_of_encoder(name: str) -> Look:
     """Return how a trait method is drawn: as the first method that drives with its traits."""
-    users = (one for one in METHODS.values() if isinstance(one, Learned) and one.encoder == name)
-    return next((one.look for one in users), Look())
+    users = (method for method in METHODS.values() if isinstance(method, Learned) and method.encoder == name)
+    return next((method.look for method in users), Look())
 
 
 # Rules and trait sources by the modules that hold them.

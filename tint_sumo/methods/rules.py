@@ -85,7 +85,7 @@ class TimeToCollision:
         next_line_m = np.r_[line_m[1:], np.inf]
         ahead = (front_m < next_line_m) & (front_m < geometry.inside_m)  # (N, K): routes the ego has yet to cross
         crossing = ((front_m >= geometry.enter_m) & (front_m < next_line_m))[:, :-1].any(axis=1)
-        blocked = np.stack([(blocking & (route == one)).any(axis=1) for one in geometry.order], axis=1)
+        blocked = np.stack([(blocking & (route == number)).any(axis=1) for number in geometry.order], axis=1)
         go = crossing | ~(blocked & ahead).any(axis=1)
         wait = np.where(front_m[:, 0] < line_m[0], CREEP, STOP)
         return np.where(go, GO, wait), (along_m, present.astype(np.float64))
@@ -111,7 +111,7 @@ class _Geometry:
         self._lines = [as_line(path.way) for path in layout.routes]
         inside = way[(zones.inside_m / SPACING_M).astype(int)]  # the ego's front where it stands in the vehicles' path
         self.meet_m = np.array(
-            [project(point[None], one)[0][0] for point, one in zip(inside, self._lines, strict=True)]
+            [project(point[None], line)[0][0] for point, line in zip(inside, self._lines, strict=True)]
         )
         self._ego_fronts_m = along(way)
         vehicle = layout.scene.vehicle

@@ -109,9 +109,9 @@ def train_policy(
     if learned.encoder is None and (traits is not None or other_scene):
         raise InputError(f"method {method} infers no traits; leave the trait model and other_scene out")
     encoder = _load_encoder(learned, traits)
-    place = described(scenes)
+    trained_in = described(scenes)
     if encoder is not None and not other_scene:
-        require_scene(traits or str(learned.encoder), place["scene"], place["scene_digest"], "the policy")
+        require_scene(traits or str(learned.encoder), trained_in["scene"], trained_in["scene_digest"], "the policy")
     settings = learned.settings_of(settings)
     identity = {
         "kind": "policy",
@@ -119,7 +119,7 @@ def train_policy(
         "p_conservative": None if p_conservative is None else [p_conservative.low, p_conservative.high],
         "steps": steps,
         "seed": seed,
-        **place,
+        **trained_in,
         "settings": asdict(settings),
         "traits": None if encoder is None else digest(encoder),
     }
@@ -193,12 +193,12 @@ def training_venv(
     scenes: Sequence[AnyScene],
 ) -> VecEnv:
     """Return environments with the traits that the method is trained with."""
-    time_limit_s = min(settings.time_limit_s, *(one.time_limit_s for one in scenes))
+    time_limit_s = min(settings.time_limit_s, *(scene.time_limit_s for scene in scenes))
     shown = learned if learned.trained_as is None else find_learned(learned.trained_as)
     return policy_venv(
         settings.n_envs,
         shown.make_source(encoder if shown.encoder else None),
-        [TaskSettings(one, p_conservative, time_limit_s=time_limit_s) for one in scenes],
+        [TaskSettings(scene, p_conservative, time_limit_s=time_limit_s) for scene in scenes],
         action_repeat=settings.action_repeat,
         critic_sees_true_traits=learned.critic_sees_true_traits,
         monitored=True,

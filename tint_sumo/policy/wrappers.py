@@ -173,7 +173,7 @@ def policy_venv(
             an episode until they are parked or reset.
     """
     tracks = source is not None and source.needs_tracks
-    seen = [replace(one, tracks=tracks) for one in settings]
+    seen = [replace(task, tracks=tracks) for task in settings]
     if seen[0].scene.sumocfg:  # one simulation per process
         seen *= num_envs
     venv: VecEnv = SceneVecEnv(num_envs, seen, autoreset=on_step is None)

@@ -115,8 +115,8 @@ def follow(
         stage, was_pos_m: number of the SUMO lane on the route, and position on it; read and written.
         front_m, boxes: written.
     """
-    for one in range(len(index)):
-        slot, position_m = index[one], lane_pos_m[one]
+    for vehicle in range(len(index)):
+        slot, position_m = index[vehicle], lane_pos_m[vehicle]
         # Vehicles only move forward: a lane position that dropped belongs to the next SUMO lane.
         if position_m < was_pos_m[slot]:
             stage[slot] += 1

@@ -72,4 +72,4 @@ def digest_of(scenes: Sequence[AnyScene]) -> str:
     """Return the digest of a scene, or of several together."""
     if len(scenes) == 1:
         return scenes[0].digest
-    return hashlib.sha256("".join(one.digest for one in scenes).encode()).hexdigest()[:16]
+    return hashlib.sha256("".join(scene.digest for scene in scenes).encode()).hexdigest()[:16]

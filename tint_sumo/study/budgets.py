@@ -81,7 +81,7 @@ class Trials:
 
     def relative_to(self, scene_tau_s: float) -> "Trials":
         """Return these trials with None for headways that are the scene's."""
-        return replace(self, conditions=tuple(one.relative_to(scene_tau_s) for one in self.conditions))
+        return replace(self, conditions=tuple(conditions.relative_to(scene_tau_s) for conditions in self.conditions))
 
 
 @dataclass(frozen=True)

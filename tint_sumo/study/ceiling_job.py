@@ -34,10 +34,10 @@ class CeilingJob:
 
     def run(self, report: Report) -> str:
         wanted = {
-            one.p_conservative: trials.episodes
+            conditions.p_conservative: trials.episodes
             for trials in self.trials
-            for one in trials.conditions
-            if one.is_single_mix
+            for conditions in trials.conditions
+            if conditions.is_single_mix
         }
         found: dict[str, float] = {}
         done, total = 0, sum(wanted.values())

@@ -102,8 +102,8 @@ def plot_conditions(rows: Sequence[Summary], file: Path) -> Path:
     figure = Figure(figsize=(11.0, 4.2), dpi=150, layout="constrained")
     all_axes = figure.subplots(1, 3, sharey=True)
     for axes, (name, title) in zip(all_axes, CONDITION_TITLES.items(), strict=True):
-        for own in by_title(rows).values():
-            _plot_line(axes, own, name)
+        for found in by_title(rows).values():
+            _plot_line(axes, found, name)
         axes.set_xlabel(title)
         axes.grid(alpha=0.25)
     all_axes[0].set_ylabel("success, all mixes (%)")

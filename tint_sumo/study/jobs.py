@@ -134,7 +134,8 @@ class EvaluateJob:
     @property
     def wanted(self) -> list[tuple[Conditions, int]]:
         """The conditions in which it is tested, and the number of cases in each."""
-        return [(one, trials.episodes) for trials in self.trials for one in trials.conditions if self._meets(one)]
+        pairs = [(conditions, trials.episodes) for trials in self.trials for conditions in trials.conditions]
+        return [(conditions, episodes) for conditions, episodes in pairs if self._meets(conditions)]
 
     def is_done(self) -> bool:
         return self.result_file.exists()
@@ -151,7 +152,7 @@ class EvaluateJob:
         scene_tau_s = self.scene.tau_s
         result = Result(self.method, origin, self.mix, self.seed, tuple(tested), self.case_set, scene_tau_s)
         write_json(self.result_file, result.to_json())
-        successes = ", ".join(f"{percent(one.evaluation.rate('success').value)}%" for one in tested)
+        successes = ", ".join(f"{percent(test.evaluation.rate('success').value)}%" for test in tested)
         return f"success {successes}"
 
     def _meets(self, conditions: Conditions) -> bool:
@@ -200,13 +201,13 @@ def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
         InputError: a file is damaged.
     """
     files = {name: sorted((out / "policies").glob(f"{name}-P*/{CURVE_FILE}")) for name in METHODS}
-    found = {name: [curve for curve in map(_read_curve, own) if len(curve)] for name, own in files.items()}
+    found = {name: [curve for curve in map(_read_curve, paths) if len(curve)] for name, paths in files.items()}
     return {name: curves for name, curves in found.items() if curves}
 
 
 def smoothed_percent(seeds: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Return success in training, %: a row for each number of decisions, a column for each seed."""
-    shares = [one.set_index("decisions")["success"].rolling(_SMOOTHED, min_periods=1).mean() for one in seeds]
+    shares = [curve.set_index("decisions")["success"].rolling(_SMOOTHED, min_periods=1).mean() for curve in seeds]
     return 100.0 * pd.concat(shares, axis=1).dropna()
 
 

@@ -31,7 +31,7 @@ def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
     encoders = dict.fromkeys(filter(None, (find_learned(name).encoder for name in trained)))
     traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
     given = rules + (shipped_policies() if budget.with_shipped and scene == paper_scene() else [])
-    trials = tuple(one.relative_to(scene.tau_s) for one in budget.trials)
+    trials = tuple(trials.relative_to(scene.tau_s) for trials in budget.trials)
     jobs: list[Job] = [*traits]
     for seed in budget.seeds:
         trainings = [
@@ -65,8 +65,8 @@ def run_study(
     found = require_scene("a study", find_scene(scene))
     _require_traits(budget, found)
     jobs = plan(budget, out, found)
-    place = {} if found == paper_scene() else described([found])
-    with claim_folder(out, {"kind": "study", **plain(budget), **place}):
+    scene_entries = {} if found == paper_scene() else described([found])
+    with claim_folder(out, {"kind": "study", **plain(budget), **scene_entries}):
         if budget.traits is not None:
             record(
                 out / DATASET,

@@ -98,9 +98,9 @@ def _success_lines(rows: Sequence[Summary], ceilings: Ceilings) -> Lines:
     lines = [["method", "seeds", *(f"P {p:g}" for p in mixes)]]
     kinds = dict.fromkeys((row.method, row.origin, row.title, row.mix) for row in by_method(rows))
     for method, origin, title, mix in kinds:
-        own = {_number(row): row for row in rows if (row.method, row.origin, row.mix) == (method, origin, mix)}
-        cells = [_with_spread(own[p]) if p in own else "-" for p in mixes]
-        lines.append([title, str(len(next(iter(own.values())).seeds)), *cells])
+        at = {_number(row): row for row in rows if (row.method, row.origin, row.mix) == (method, origin, mix)}
+        cells = [_with_spread(at[p]) if p in at else "-" for p in mixes]
+        lines.append([title, str(len(next(iter(at.values())).seeds)), *cells])
     if ceilings:
         lines.append(["ceiling", "", *(percent(ceilings[p]) if p in ceilings else "-" for p in mixes)])
     paper = {_number(row): row.published["success"] for row in rows if row.method == "vae" and row.published}
@@ -130,9 +130,9 @@ def _outcome_lines(rows: Sequence[Summary]) -> Lines:
 def _collision_lines(rows: Sequence[Row]) -> Lines:
     kinds = sorted({kind for row in rows for kind in row.collisions})
     lines = [["method", *kinds]]
-    for title, own in by_title(rows).items():
-        cases = sum(row.episodes * len(row.seeds) for row in own)
-        counts = [sum(row.collisions.get(kind, 0) for row in own) for kind in kinds]
+    for title, found in by_title(rows).items():
+        cases = sum(row.episodes * len(row.seeds) for row in found)
+        counts = [sum(row.collisions.get(kind, 0) for row in found) for kind in kinds]
         lines.append([title, *(f"{1000 * count / cases:.1f}" for count in counts)])
     return lines
 
@@ -149,10 +149,10 @@ def _difference_lines(rows: Sequence[Row]) -> Lines:
     for other in ("oracle", "no_labels"):
         references = {_number(row): row for row in trained if row.method == other}
         for method in dict.fromkeys(row.method for row in by_method(trained) if row.method != other):
-            own = {_number(row): row for row in trained if row.method == method}
-            if references and own:
-                cells = [_difference(own.get(p), references.get(p)) for p in mixes]
-                lines.append([next(iter(own.values())).title, next(iter(references.values())).title, *cells])
+            at = {_number(row): row for row in trained if row.method == method}
+            if references and at:
+                cells = [_difference(at.get(p), references.get(p)) for p in mixes]
+                lines.append([next(iter(at.values())).title, next(iter(references.values())).title, *cells])
     return lines
 
 
@@ -165,13 +165,10 @@ def _difference(row: Row | None, other: Row | None) -> str:
 
 def _condition_lines(rows: Sequence[Summary]) -> Lines:
     varied = list(dict.fromkeys(row.conditions for row in rows))
-    lines = [["method", *(one.label for one in varied)]]
-    for title, own in by_title(rows).items():
-        at = {row.conditions: row for row in own}
-        cells = [
-            f"{percent(at[one].rate('success'))} ({percent(at[one].rate('collision'))})" if one in at else "-"
-            for one in varied
-        ]
+    lines = [["method", *(conditions.label for conditions in varied)]]
+    for title, found in by_title(rows).items():
+        rates = {row.conditions: [percent(row.rate(outcome)) for outcome in ("success", "collision")] for row in found}
+        cells = ["{} ({})".format(*rates[conditions]) if conditions in rates else "-" for conditions in varied]
         lines.append([title, *cells])
     return lines
 

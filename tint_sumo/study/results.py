@@ -47,11 +47,11 @@ class Result:
             "scene_tau_s": self.scene_tau_s,
             "tested": [
                 {
-                    **plain(one.conditions.resolved(self.scene_tau_s)),
-                    **one.evaluation.summary(),
-                    "cases": [astuple(case) for case in one.evaluation.cases],
+                    **plain(test.conditions.resolved(self.scene_tau_s)),
+                    **test.evaluation.summary(),
+                    "cases": [astuple(case) for case in test.evaluation.cases],
                 }
-                for one in self.tested
+                for test in self.tested
             ],
         }
 
@@ -59,7 +59,7 @@ class Result:
     def read(cls, file: Path) -> "Result":
         """Raises InputError if the file is damaged."""
         stored = read_record(file, "result of a study", _Stored, RESULT_BYTES)
-        tested = tuple(one.measured(stored.scene_tau_s) for one in stored.tested)
+        tested = tuple(test.measured(stored.scene_tau_s) for test in stored.tested)
         return cls(stored.method, stored.origin, stored.mix, stored.seed, tested, stored.case_set, stored.scene_tau_s)
 
 
@@ -117,6 +117,6 @@ def read_results(out: Path) -> list[Result]:
     if not files:
         raise InputError(f"no results in {out}; run the study first")
     results = [Result.read(file) for file in files]
-    if any(one.case_set != REPORTED_SET for one in results):
+    if any(result.case_set != REPORTED_SET for result in results):
         raise InputError(f"{out} is part of a sweep, whose cases no study reports; read sweep.md in the folder above")
     return results

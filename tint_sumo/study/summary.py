@@ -96,7 +96,7 @@ class Row(Summary):
 
     def hits(self, outcome: str) -> Hits:
         """Return whether there was an outcome, (seeds, cases)."""
-        return np.array([[case.outcome == outcome for case in one.cases] for one in self.evaluations])
+        return np.array([[case.outcome == outcome for case in evaluation.cases] for evaluation in self.evaluations])
 
     def rate(self, outcome: str) -> float:
         return float(self.hits(outcome).mean())
@@ -122,7 +122,7 @@ class Row(Summary):
 
     @property
     def _pooled(self) -> Evaluation:
-        return Evaluation(tuple(case for one in self.evaluations for case in one.cases))
+        return Evaluation(tuple(case for evaluation in self.evaluations for case in evaluation.cases))
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -149,7 +149,7 @@ AnyRow = TypeVar("AnyRow", bound=Summary)
 def tabulate(results: Sequence[Result]) -> list[Row]:
     """Return one row per conditions, origin, method and mix in training; methods in the registry's order."""
     order = {name: position for position, name in enumerate(METHODS)}
-    flat = [(result, one) for result in results for one in result.tested]
+    flat = [(result, test) for result in results for test in result.tested]
 
     def key(pair: tuple[Result, Any]) -> tuple[Any, ...]:
         result, conditions = pair[0], pair[1].conditions
@@ -172,7 +172,7 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
         members = sorted(group, key=lambda pair: pair[0].seed)
         first, tested = members[0]
         seeds = tuple(result.seed for result, _ in members)
-        evaluations = tuple(one.evaluation for _, one in members)
+        evaluations = tuple(test.evaluation for _, test in members)
         rows.append(
             Row(first.method, first.origin, first.mix, tested.conditions, seeds, first.scene_tau_s, evaluations)
         )

@@ -157,8 +157,8 @@ def overlapping(table: pd.DataFrame) -> pd.DataFrame:
         first, second = tree.query(boxes[rows], predicate="intersects")
         found.append(np.stack([rows[first], rows[second]])[:, first < second])
     pairs = np.concatenate(found, axis=1) if found else np.zeros((2, 0), np.int64)
-    one = {name: table[name].to_numpy()[pairs[0]] for name in ("recording", "time_s", "vehicle")}
-    return pd.DataFrame({**one, "other": table["vehicle"].to_numpy()[pairs[1]]})
+    found_at = {name: table[name].to_numpy()[pairs[0]] for name in ("recording", "time_s", "vehicle")}
+    return pd.DataFrame({**found_at, "other": table["vehicle"].to_numpy()[pairs[1]]})
 
 
 def _boxes(table: pd.DataFrame) -> NDArray[np.object_]:

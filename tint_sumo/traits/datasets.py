@@ -175,7 +175,7 @@ def require_noise(noise_m: float) -> None:
 def require_used(method: str, settings: TraitSettings) -> None:
     """Raise InputError if settings that a method does not use are others than in all budgets that have names."""
     for name in find_trait_method(method).unused_settings:
-        if getattr(settings, name) not in {getattr(one, name) for one in TRAIT_BUDGETS.values()}:
+        if getattr(settings, name) not in {getattr(budget, name) for budget in TRAIT_BUDGETS.values()}:
             raise InputError(f"method {method} does not use {name}; leave it out of the budget")
 
 

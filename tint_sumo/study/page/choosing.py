@@ -1,5 +1,6 @@
 """Choice of the policies and cases that the page's player shows."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -42,14 +43,15 @@ class Choice:
 def choose(rows: Sequence[Row]) -> Choice:
     """Return the conditions in which most policies were tested, and cases in which their outcomes differ."""
     tested = at_mixes(rows) or over_all_mixes(rows)
-    numbers = {one: sum(row.conditions == one for row in tested) for one in (row.conditions for row in tested)}
-    common = [one for one, number in numbers.items() if number == max(numbers.values())]
+    numbers = Counter(row.conditions for row in tested)
+    common = [conditions for conditions, number in numbers.items() if number == max(numbers.values())]
     conditions = common[(len(common) - 1) // 2]
-    firsts = {title: own[0] for title, own in by_title([row for row in tested if row.conditions == conditions]).items()}
+    by_policy = by_title([row for row in tested if row.conditions == conditions])
+    firsts = {title: found[0] for title, found in by_policy.items()}
     policies = tuple(
         Shown(title, row.method, row.mix, row.seeds[0], row.evaluations[0]) for title, row in firsts.items()
     )
-    return Choice(conditions, policies, choose_cases([one.evaluation for one in policies]))
+    return Choice(conditions, policies, choose_cases([policy.evaluation for policy in policies]))
 
 
 def choose_cases(evaluations: Sequence[Evaluation]) -> tuple[int, ...]:
@@ -57,15 +59,15 @@ def choose_cases(evaluations: Sequence[Evaluation]) -> tuple[int, ...]:
 
     A case in which several policies fail counts for all of them.
     """
-    common = range(min(len(one.cases) for one in evaluations))
-    best_first = sorted(evaluations, key=lambda one: -one.rate("success").value)
+    common = range(min(len(evaluation.cases) for evaluation in evaluations))
+    best_first = sorted(evaluations, key=lambda evaluation: -evaluation.rate("success").value)
     chosen: list[int] = []
     for wanted in range(1, _FAILURES_OF_EACH + 1):
-        for one in best_first:
+        for evaluation in best_first:
             for outcome in FAILURES:
-                failed = [number for number in common if one.cases[number].outcome == outcome]
+                failed = [number for number in common if evaluation.cases[number].outcome == outcome]
                 missing = wanted - len(set(failed) & set(chosen))
                 chosen += [number for number in failed if number not in chosen][: max(missing, 0)]
-    successes = [sum(one.cases[number].outcome == "success" for one in evaluations) for number in common]
+    successes = [sum(evaluation.cases[number].outcome == "success" for evaluation in evaluations) for number in common]
     finished = sorted((number for number in common if number not in chosen), key=lambda number: -successes[number])
     return tuple(sorted([*chosen[: MOST_CASES - _SUCCESSES], *finished[:_SUCCESSES]]))

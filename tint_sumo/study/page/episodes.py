@@ -43,16 +43,16 @@ def record_episodes(out: Path, scene: Scene, choice: Choice, *, workers: Workers
     """
     ready: list[tuple[Shown, Recording]] = []
     refusals = []
-    for one in choice.policies:
-        recording = Recording(one.method, one.mix, one.seed, choice.conditions, choice.cases, out, scene)
+    for shown in choice.policies:
+        recording = Recording(shown.method, shown.mix, shown.seed, choice.conditions, choice.cases, out, scene)
         try:
             recording.require_policy()
         except InputError as error:
-            refusals.append(f"{one.title}: {error}")
+            refusals.append(f"{shown.title}: {error}")
         else:
-            ready.append((one, recording))
+            ready.append((shown, recording))
     record_all([recording for _, recording in ready], out, workers, progress)
-    recorded = tuple(Recorded(one, read_episodes(recording.file)) for one, recording in ready)
+    recorded = tuple(Recorded(shown, read_episodes(recording.file)) for shown, recording in ready)
     return Recordings(scene, choice, recorded, tuple(refusals))
 
 
@@ -65,26 +65,27 @@ def player_data(recordings: Recordings) -> str:
         "scene": scene_shapes(recordings.scene),
         "policies": [
             {
-                "label": one.policy.label,
-                "title": one.policy.title,
-                "colour": look_of(one.policy.method).colour,
-                "outcomes": {str(case): episode["outcome"] for case, episode in one.episodes.items()},
+                "label": recorded.policy.label,
+                "title": recorded.policy.title,
+                "colour": look_of(recorded.policy.method).colour,
+                "outcomes": {str(case): episode["outcome"] for case, episode in recorded.episodes.items()},
             }
-            for one in recordings.policies
+            for recorded in recordings.policies
         ],
     }
     episodes = [
-        packed(f"episode-{one.policy.label}-{case}", json.dumps(episode, separators=(",", ":")))
-        for one in recordings.policies
-        for case, episode in one.episodes.items()
+        packed(f"episode-{recorded.policy.label}-{case}", json.dumps(episode, separators=(",", ":")))
+        for recorded in recordings.policies
+        for case, episode in recorded.episodes.items()
     ]
     return json_data("player-data", contents) + "".join(episodes)
 
 
 def _opening(policies: Sequence[Recorded]) -> Shown:
     """Return the policy that is shown first: the most successful one of those that infer traits, or else of all."""
-    inferring = [one for one in policies if getattr(METHODS.get(one.policy.method), "encoder", None)]
-    return max((one.policy for one in inferring or policies), key=lambda one: one.evaluation.rate("success").value)
+    shown = [recorded.policy for recorded in policies]
+    inferring = [policy for policy in shown if getattr(METHODS.get(policy.method), "encoder", None)]
+    return max(inferring or shown, key=lambda policy: policy.evaluation.rate("success").value)
 
 
 def player_notes(recordings: Recordings) -> str:
@@ -102,22 +103,22 @@ def player_notes(recordings: Recordings) -> str:
 
 def failure_lists(recordings: Recordings) -> str:
     """Return how often each policy failed, with its recorded failures, folded, as buttons that open the player."""
-    return "".join(_failures(one) for one in recordings.policies)
+    return "".join(_failures(recorded) for recorded in recordings.policies)
 
 
-def _failures(one: Recorded) -> str:
-    cases = one.policy.evaluation.cases
+def _failures(recorded: Recorded) -> str:
+    cases = recorded.policy.evaluation.cases
     counts = {outcome: sum(case.outcome == outcome for case in cases) for outcome in FAILURES}
-    failed = {case: episode for case, episode in one.episodes.items() if episode["outcome"] in FAILURES}
+    failed = {case: episode for case, episode in recorded.episodes.items() if episode["outcome"] in FAILURES}
     if not failed and not any(counts.values()):
         return ""
     counted = " and ".join(_count(number, outcome) for outcome, number in counts.items())
     buttons = [
-        f'<button type="button" data-policy="{escape(one.policy.label)}" data-case="{case}">'
+        f'<button type="button" data-policy="{escape(recorded.policy.label)}" data-case="{case}">'
         f"{escape(_failure(case, episode))}</button>"
         for case, episode in failed.items()
     ]
-    summary = f"{one.policy.title}: {counted} in {len(cases)} cases; {len(failed)} of them recorded"
+    summary = f"{recorded.policy.title}: {counted} in {len(cases)} cases; {len(failed)} of them recorded"
     return folded(summary, bullets(buttons)) if buttons else paragraph(summary)
 
 

@@ -21,15 +21,15 @@ def what_came_out(rows: Sequence[Summary]) -> str:
     as_trained = [row for row in over_all_mixes(rows) if row.conditions == Conditions(row.conditions.p_conservative)]
     methods = by_title(at_mixes(rows) or as_trained)
     mixes = sorted(
-        set.intersection(*({row.conditions.p_conservative for row in own} for own in methods.values()))
+        set.intersection(*({row.conditions.p_conservative for row in tested} for tested in methods.values()))
         if methods
         else (),
         key=str,
     )
     if not mixes:
         return ""
-    shown = {title: [row for row in own if row.conditions.p_conservative in mixes] for title, own in methods.items()}
-    rates = {title: sum(row.rate("success") for row in own) / len(own) for title, own in shown.items()}
+    shown = by_title([row for tested in methods.values() for row in tested if row.conditions.p_conservative in mixes])
+    rates = {title: sum(row.rate("success") for row in tested) / len(tested) for title, tested in shown.items()}
     at = f"At P {_listed([mix.text for mix in mixes])}"
     if len(rates) == 1:
         ((title, rate),) = rates.items()
@@ -39,8 +39,8 @@ def what_came_out(rows: Sequence[Summary]) -> str:
         return f"{at} all {len(rates)} methods succeeded in {percent(rates[best])} % of the cases."
     text = f"{at} the method {best} succeeded most often, in {percent(rates[best])} % of the cases, and {worst} least "
     text += f"often, in {percent(rates[worst])} %."
-    inferring = [title for title, own in shown.items() if _infers(own[0].method)]
-    without = [title for title, own in shown.items() if own[0].method == "no_labels"]
+    inferring = [title for title, tested in shown.items() if _infers(tested[0].method)]
+    without = [title for title, tested in shown.items() if tested[0].method == "no_labels"]
     if inferring and without:
         helped, bare = max(inferring, key=rates.__getitem__), max(without, key=rates.__getitem__)
         text += f" The best method that infers traits, {helped}, reached {percent(rates[helped])} %; {bare}, which "

@@ -29,7 +29,7 @@ def read_latents(out: Path, methods: Sequence[str], *, progress: bool) -> dict[s
         InputError: a model is damaged.
     """
     known = [METHODS[name] for name in methods if name in METHODS]
-    encoders = dict.fromkeys(one.encoder for one in known if isinstance(one, Learned) and one.encoder)
+    encoders = dict.fromkeys(method.encoder for method in known if isinstance(method, Learned) and method.encoder)
     if not encoders:
         return None
     data = out / EPISODES / "windows"
@@ -45,20 +45,20 @@ def read_latents(out: Path, methods: Sequence[str], *, progress: bool) -> dict[s
         "step_s": STEP_S,
         "windows": [
             {
-                "driver": int(drawn.driver[one]),
-                "trait": int(labels[one]),
-                **{name: float(value) for name, value in drivers.iloc[one].items()},
-                **_states(drawn, one),
+                "driver": int(drawn.driver[number]),
+                "trait": int(labels[number]),
+                **{name: float(value) for name, value in drivers.iloc[number].items()},
+                **_states(drawn, number),
             }
-            for one in range(len(drawn))
+            for number in range(len(drawn))
         ],
         "models": [{"name": name, **_model(out, name, drawn)} for name in encoders],
     }
 
 
-def _states(windows: Windows, one: int) -> dict[str, list[int | None]]:
+def _states(windows: Windows, number: int) -> dict[str, list[int | None]]:
     """Return the window's valid steps; no gap where there is no leader."""
-    steps = windows.states[one, : windows.length[one]]
+    steps = windows.states[number, : windows.length[number]]
     offsets, gaps = np.rint(steps / _STEP_M).astype(int).T.tolist()
     led = steps[:, 1] < NO_LEADER_GAP_M
     return {"offsets": offsets, "gaps": [gap if there else None for gap, there in zip(gaps, led, strict=True)]}

@@ -190,33 +190,33 @@ class RecordJob:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        return tuple(path for one in self.recordings for path in one.inputs)
+        return tuple(path for recording in self.recordings for path in recording.inputs)
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        return tuple(one.path for one in self.recordings)
+        return tuple(recording.path for recording in self.recordings)
 
     def is_done(self) -> bool:
         return not self._missing()
 
     def _missing(self) -> list[Recording]:
-        placed = [replace(one, out=self.out) for one in self.recordings]
-        return [one for one in placed if not one.is_done()]
+        placed = [replace(recording, out=self.out) for recording in self.recordings]
+        return [recording for recording in placed if not recording.is_done()]
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
         missing = self._missing()
-        total, done = sum(len(one.cases) for one in missing), 0
-        for one in missing:
-            one.make(part_of(report, done, total))
-            done += len(one.cases)
+        total, done = sum(len(recording.cases) for recording in missing), 0
+        for recording in missing:
+            recording.make(part_of(report, done, total))
+            done += len(recording.cases)
         return f"policies: {len(missing)}"
 
 
 def record_all(recordings: Sequence[Recording], out: Path, workers: Workers, progress: bool) -> None:
     """Make the recordings of the study in ``out`` that are not there yet."""
     executor = executor_of(workers)
-    missing = tuple(one for one in recordings if not one.is_done())
+    missing = tuple(recording for recording in recordings if not recording.is_done())
     count = min(executor.slots, len(missing))
     executor.run([RecordJob(number, missing[number::count], out) for number in range(count)], progress)
 
@@ -234,7 +234,7 @@ def read_episodes(file: Path) -> dict[int, dict[str, Any]]:
         raise damaged(file, _WHAT, error) from None
     if list(found.episodes) != [str(case) for case in found.recorded.cases]:
         raise damaged(file, _WHAT, "it has other episodes than it says")
-    return {int(case): one for case, one in content["episodes"].items()}
+    return {int(case): episode for case, episode in content["episodes"].items()}
 
 
 def _digest(policy: str | Path) -> str:

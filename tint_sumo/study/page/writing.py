@@ -70,7 +70,7 @@ def write_page(report: StudyReport, out: Path, *, workers: Workers = 2, progress
     study = _Study(
         out,
         report.rows,
-        {one.heading: one for one in report.tables},
+        {found.heading: found for found in report.tables},
         curve_chart(curves) if curves else None,
         record_episodes(out, read_scene_of(out), choose(report.rows), workers=workers, progress=progress),
         read_latents(out, [row.method for row in report.rows], progress=progress),
@@ -115,7 +115,7 @@ def _page(study: _Study) -> str:
         style=style,
         contents="".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, heading, _ in sections),
         sections="".join(section(name, heading, content) for name, heading, content in sections),
-        data=json_data("chart-data", {one.name: one.figure for one in charts}) + _data(study),
+        data=json_data("chart-data", {drawn.name: drawn.figure for drawn in charts}) + _data(study),
         script=script,
         plotly=_without_maps(plotly) + packed("plotly", plotly) if charts else "",
     )
@@ -137,12 +137,12 @@ def _summary(rows: Sequence[Row]) -> list[str]:
     episodes = sum(row.episodes * len(row.seeds) for row in rows)
     trained = "1 seed" if seeds == 1 else f"up to {seeds} seeds"
     sizes = f"{methods} methods, {trained} of each, {episodes:,} episodes in all."
-    return [one for one in (what_came_out(rows), MEANING_OF_P, sizes) if one]
+    return [text for text in (what_came_out(rows), MEANING_OF_P, sizes) if text]
 
 
-def _shown(one: Chart, charts: list[Chart]) -> str:
-    charts.append(one)
-    return chart(one.name, one.description, one.lines)
+def _shown(drawn: Chart, charts: list[Chart]) -> str:
+    charts.append(drawn)
+    return chart(drawn.name, drawn.description, drawn.lines)
 
 
 def _results(study: _Study, charts: list[Chart]) -> str:
@@ -161,8 +161,8 @@ def _results(study: _Study, charts: list[Chart]) -> str:
     return "".join(parts)
 
 
-def _table(one: Table) -> str:
-    return f"<h3>{escape(one.heading)}</h3>" + table(one.lines, one.heading) + paragraph(one.note)
+def _table(found: Table) -> str:
+    return f"<h3>{escape(found.heading)}</h3>" + table(found.lines, found.heading) + paragraph(found.note)
 
 
 def _curves(study: _Study, charts: list[Chart]) -> str:
@@ -176,9 +176,9 @@ def _conditions(study: _Study, charts: list[Chart]) -> str:
     varied = over_all_mixes(study.rows)
     if not varied:
         return _left_out("the study tested its policies in the conditions of their training alone")
-    shown = [_shown(one, charts) for one in condition_charts(varied)]
+    shown = [_shown(drawn, charts) for drawn in condition_charts(varied)]
     return "".join(
-        [*shown, *(_table(one) for one in study.tables.values() if one.heading.startswith("Other conditions"))]
+        [*shown, *(_table(found) for found in study.tables.values() if found.heading.startswith("Other conditions"))]
     )
 
 
@@ -217,7 +217,7 @@ def _making(study: _Study) -> str:
     else:
         parts.append(_left_out("the study's folder has no settings"))
     seeds = [["method", "seeds"]]
-    seeds += [[title, ", ".join(map(str, own))] for title, own in _seeds(study.rows).items()]
+    seeds += [[title, ", ".join(map(str, numbers))] for title, numbers in _seeds(study.rows).items()]
     parts.append(folded("Seeds of the trainings", table(seeds, "Seeds of the trainings")))
     versions = _versions(study.out)
     if versions:

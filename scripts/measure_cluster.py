@@ -1,4 +1,4 @@
-"""How much faster a recording and an evaluation are on more nodes: nodes of 0.4 cores each on this machine.
+"""Measure how much faster a recording and an evaluation are on more nodes: nodes of 0.4 cores each on this machine.
 
 Run as root on Linux with control groups of version 1, which limit the nodes: python scripts/measure_cluster.py
 """

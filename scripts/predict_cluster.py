@@ -1,4 +1,4 @@
-"""How long studies take on clusters of 2-core machines: measures their jobs here, then places them in their order.
+"""Predict how long studies take on clusters of 2-core machines: measure their jobs here, then lay them out in order.
 
 python scripts/predict_cluster.py
 """
@@ -38,7 +38,7 @@ STUDIES = {
 
 @dataclass(frozen=True)
 class Times:
-    """What jobs take on one core while their like keep the others busy."""
+    """Durations of jobs on one core while others of their kind keep the other cores busy."""
 
     start_s: float  # of any job
     decision_s: dict[str, float]  # of a training, by method; none for methods that share another one's training

@@ -20,7 +20,7 @@ settings.register_profile("tint_sumo", deadline=None)  # no test fails because t
 settings.load_profile("tint_sumo")
 
 
-# What a shell of a script starts in the background ignores Ctrl-C, and so would all that tests start.
+# Processes that a script starts in the background ignore Ctrl-C, and so would all that tests start.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

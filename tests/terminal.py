@@ -13,7 +13,7 @@ def open_terminal() -> tuple[int, int]:
 
 
 def look(terminal: int, patience_s: float) -> str:
-    """What is shown next; nothing if nobody writes there any more, or not in time."""
+    """Return the next output; nothing if nobody writes there any more, or not in time."""
     if not select.select([terminal], [], [], patience_s)[0]:
         return ""
     try:

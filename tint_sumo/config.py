@@ -224,7 +224,7 @@ AnyMix = Mix | float | Sequence[float]  # what users write for a mix; parsed whe
 
 @dataclass(frozen=True)
 class Traffic:
-    """How drivers appear on the street."""
+    """Arrivals of drivers on the street, and their mix."""
 
     p_conservative: Mix = Mix(0.4)
     arrivals_per_s: ArrivalsPerS | None = None  # Poisson rate per lane; None: saturated, enter as soon as there is room

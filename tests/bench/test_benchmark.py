@@ -90,7 +90,7 @@ def test_training_is_measured_without_sb3_contrib(monkeypatch: pytest.MonkeyPatc
 
 
 class Work:
-    """Spends time as a fake clock tells."""
+    """Takes its time from a fake clock."""
 
     def __init__(self) -> None:
         self.now_s = 0.0

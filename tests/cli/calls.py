@@ -59,7 +59,7 @@ class Started:
         os.close(theirs)
 
     def interrupt_at(self, pattern: str, sent: signal.Signals) -> str:
-        """What it printed after the interruption."""
+        """Return the lines that it printed after the interruption."""
         seen, end = "", time.monotonic() + PATIENCE_S
         while not re.search(pattern, seen):
             assert time.monotonic() < end, seen

@@ -13,13 +13,13 @@ SHELLS = ("bash", "zsh", "tcsh")
 
 @pytest.fixture(scope="module")
 def script() -> str:
-    """What a fresh process prints for bash."""
+    """Return the script that a fresh process prints for bash."""
     command = [sys.executable, "-m", "tint_sumo.cli", "--print-completion", "bash"]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 def completions(script: str, *words: str) -> list[str]:
-    """What bash offers for the last word when TAB is pressed."""
+    """Return the words that bash offers for the last one when TAB is pressed."""
     lines = [
         script,
         f"COMP_WORDS=({' '.join(map(repr, words))})",

@@ -230,9 +230,9 @@ def test_bad_files_are_refused_in_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     file = written(tmp_path, text)
-    told = refuse(capsys, *command.split(), "--config", file)
-    assert message in told
-    assert str(file) in told or "out: x" in text or "needs a folder" in told
+    error = refuse(capsys, *command.split(), "--config", file)
+    assert message in error
+    assert str(file) in error or "out: x" in text or "needs a folder" in error
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
 
 
@@ -243,7 +243,7 @@ def test_missing_and_unreadable_files(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "is not a text file" in refuse(capsys, "bench", "--config", tmp_path / "binary.yaml")
 
 
-# What can be defined there
+# Definitions in configuration files
 
 DRIVERS = """
 population:

@@ -10,7 +10,7 @@ from tests.commands import commands
 from tint_sumo.cli import main
 from tint_sumo.core.files import PICTURE_SUFFIXES, RUN_FILE, write_json, write_text
 
-# How each command that writes is called; OUT is what it must not touch.
+# A call of each command that writes files; it must not touch OUT.
 WRITING = {
     "net": "net --out OUT",
     "record": "record --windows 20 --out OUT",

@@ -1,4 +1,4 @@
-"""What the system refuses ends a command in one line, and what was whole stays whole: real processes, full disks."""
+"""Refusals of the system end a command in one line; whole files stay whole: real processes, full disks."""
 
 import os
 import re

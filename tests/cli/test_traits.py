@@ -33,7 +33,7 @@ def test_traits_infer(
     assert printed["columns"] == list(table)
     assert printed["windows"] == len(table) == json.loads((dataset / "manifest.json").read_text())["windows"]
     assert printed["vehicles"] == table["vehicle"].nunique()
-    assert printed["outside"] is None  # this model's card does not tell
+    assert printed["outside"] is None  # this model's card does not say
     assert main(["traits", "infer", "--fcd", str(dataset), "--model", "vae", "--out", str(out)]) == 0
     text = capsys.readouterr().out
     assert re.search(r"\n<?\d+\.\d% of the windows lie outside what the model was trained on\n", text)

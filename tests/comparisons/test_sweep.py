@@ -146,7 +146,7 @@ def test_policies_are_tested_at_the_mixes_of_their_training(brief: PpoSettings) 
     assert Sweep(brief, {"n_epochs": [1]}, p_conservative=Mix(0.3, 0.6)).tested == (0.4, 0.6)
 
 
-# What is refused
+# Bad input
 
 
 def test_words_say_values_as_files_do() -> None:
@@ -191,9 +191,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 ) -> None:
     out = tmp_path / "sweep"
     assert main(["policy", "sweep", "--out", str(out), "--set", *words.split()]) == 2
-    told = capsys.readouterr().err
-    assert message in told
-    assert len(told.splitlines()) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.splitlines()) == 1
     assert not out.exists()
 
 

@@ -1,4 +1,4 @@
-"""Which files of a folder have changed, and how they get to another one."""
+"""Changes of the files in a folder, and their way to another folder."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""How shares are written: by people's rule, and never as all or nothing of what is neither."""
+"""Shares in percent: by people's rule, and never as all or nothing of what is neither."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""Where runs come from, as their folders tell."""
+"""Origin of runs: command, commit and versions in their folders."""
 
 import json
 import subprocess
@@ -66,10 +66,10 @@ def test_a_new_run_tells_of_its_command(tmp_path: Path) -> None:
     with made_by(ORIGIN):
         claim(tmp_path / "run")
         claim(tmp_path / "other", with_versions=False)
-    told = json.loads((tmp_path / "run" / "provenance.json").read_text())
-    assert set(told) == {"command", "commit", "versions"}
-    assert told["command"] == "tint-sumo record --out 'my data'"
-    assert told["versions"]["python"] == sys.version.split()[0]
+    content = json.loads((tmp_path / "run" / "provenance.json").read_text())
+    assert set(content) == {"command", "commit", "versions"}
+    assert content["command"] == "tint-sumo record --out 'my data'"
+    assert content["versions"]["python"] == sys.version.split()[0]
     assert (tmp_path / "run" / "config.yaml").read_text() == "out: my data\n"
     assert set(json.loads((tmp_path / "other" / "provenance.json").read_text())) == {"command", "commit"}
     assert json.loads((tmp_path / "run" / "run.json").read_text()) == {"seed": 1}
@@ -110,8 +110,8 @@ def test_a_recorded_dataset_can_be_recorded_again_from_its_own_configuration(
     monkeypatch.chdir(tmp_path)
     words = ["record", "--out", "data", "--windows", "40", "--p-conservative", "0.2", "0.8", "--workers", "2"]
     assert main(words) == 0
-    told = json.loads(Path("data/provenance.json").read_text())
-    assert told == {"command": f"tint-sumo {' '.join(words)}", "commit": commit()}
+    content = json.loads(Path("data/provenance.json").read_text())
+    assert content == {"command": f"tint-sumo {' '.join(words)}", "commit": commit()}
     assert "versions" in json.loads(Path("data/manifest.json").read_text())
     assert parse(["record", "--config", "data/config.yaml"]).windows == 40
     assert main(["record", "--config", "data/config.yaml", "--out", "again", "--workers", "1"]) == 0

@@ -70,13 +70,13 @@ def test_a_value_survives_the_way_to_a_file_and_back() -> None:
         ({"name": ["long" * 1000]}, "name: must be text, not ['longlong"),
     ],
 )
-def test_what_does_not_fit_is_told_in_a_line(value: Any, message: str) -> None:
+def test_values_that_do_not_fit_are_refused_in_a_line(value: Any, message: str) -> None:
     with pytest.raises(FieldError) as refused:
         build(Whole, value)
-    told = str(refused.value)
-    assert told.startswith(message)
-    assert "\n" not in told
-    assert len(told) < 300
+    error = str(refused.value)
+    assert error.startswith(message)
+    assert "\n" not in error
+    assert len(error) < 300
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"[" * 100_000, b'{"name": "\xff"}', b'{"name": ' + b"9" * 5000 + b"}"])

@@ -153,8 +153,8 @@ def test_evaluations_read_successes(tmp_path: Path) -> None:
 def test_gymnasium_makes_vectors_in_every_way(mode: AutoresetMode) -> None:
     rewards = []
     for way in ("vector_entry_point", "sync", "async"):
-        told: dict[str, Any] = {"autoreset_mode": mode}
-        kwargs = told if way == "vector_entry_point" else {"vector_kwargs": told}
+        arguments: dict[str, Any] = {"autoreset_mode": mode}
+        kwargs = arguments if way == "vector_entry_point" else {"vector_kwargs": arguments}
         with closing(gymnasium.make_vec(ENV_ID, 2, way, time_limit_s=0.3, **kwargs)) as env:
             env.reset(seed=5)
             rewards.append([env.step(np.full(2, GO))[1].tolist() for _ in range(5)])

@@ -205,6 +205,6 @@ def test_an_episode_that_ended_with_a_collision_has_its_details() -> None:
                 assert batch.collision_info(0) == {}
             if batch.rows["terminated"][0] and batch.simulation.egos.collision[0] is not None:
                 break
-        event, told = batch.simulation.egos.collision[0], batch.collision_info(0)
-        assert event is not None and told["trait"] == "aggressive"
-        assert (told["route"], told["slot"], told["ego_m"]) == (event.route, event.slot, (event.ego_x_m, event.ego_y_m))
+        event, info = batch.simulation.egos.collision[0], batch.collision_info(0)
+        assert event is not None and info["trait"] == "aggressive"
+        assert (info["route"], info["slot"], info["ego_m"]) == (event.route, event.slot, (event.ego_x_m, event.ego_y_m))

@@ -86,8 +86,8 @@ def test_rows_are_judged_one_by_one() -> None:
     front_m, collided, steps = (np.array(part) for part in zip(*cases, strict=True))
     assert judge(front_m, np.arange(len(cases), dtype=float), collided, steps, RULES, rows)
     for row, case, speed_mps in zip(rows, cases, range(len(cases)), strict=True):
-        told = judged(*case, speed_mps)[0]
-        assert all(row[name] == told[name] for name in ("outcome", "reward", "terminated", "truncated"))
+        alone = judged(*case, speed_mps)[0]
+        assert all(row[name] == alone[name] for name in ("outcome", "reward", "terminated", "truncated"))
     assert {outcome_name(row["outcome"]) for row in rows} == {"", *OUTCOMES}
 
 
@@ -162,12 +162,12 @@ def test_infos_of_a_row() -> None:
     assert {name: begun[name] for name in ("outcome", "time_s")} == {"outcome": "", "time_s": 0.3}
     assert set(begun) == {"traits", "passed", "outcome", "time_s"}
     begun["traits"][:] = 5
-    assert rows["traits"][0].tolist() == [1, -1], "an info keeps what it told"
+    assert rows["traits"][0].tolist() == [1, -1], "an info keeps its values"
     terms = {"goal": 2.5, "collision": 0.0, "speed": 0.0, "step": 0.0}
     assert set(step_info(going_on, ("traits",), {})) == {"traits", "outcome", "time_s", "reward_terms"}
-    told = step_info(over, (), {"trait": "aggressive"})
-    assert told.pop("reward_terms") == terms
-    assert told == {"outcome": "success", "time_s": 0.3, "is_success": True, "collision": {"trait": "aggressive"}}
+    info = step_info(over, (), {"trait": "aggressive"})
+    assert info.pop("reward_terms") == terms
+    assert info == {"outcome": "success", "time_s": 0.3, "is_success": True, "collision": {"trait": "aggressive"}}
     assert end_info("timeout", {}) == {"is_success": False}
     assert outcome_names(np.array([0, 3, 2, 1])).tolist() == ["", "collision", "timeout", "success"]
     copies = copied(rows)

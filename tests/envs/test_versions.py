@@ -11,7 +11,7 @@ from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.simulation import SceneSimulation
 
-# Of the states under the actions below, computed when TIntersection-v1 was registered.
+# Digests of the states under the actions below, computed when TIntersection-v1 was registered.
 T_INTERSECTION_V1 = "845b4ba7b9c15091bd26cb1fd64ee7697bb1266f0c2cf7136772ea95e2f3f6e7"
 
 

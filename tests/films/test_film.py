@@ -89,8 +89,8 @@ def test_only_those_that_slow_down_brake() -> None:
 
 def test_a_reader_is_the_less_sure_the_wider_the_spread() -> None:
     reader = TraitReader(np.array([2.0, 0.0]), 0.0, has_spread=True)
-    told = np.array([[1.0, 0.0, 0.0, 0.0, 1.0], [1.0, 0.0, 2.0, 0.0, 1.0], [-1.0, 0.0, 0.0, 9.0, 1.0], [0.0] * 5])
-    sure, unsure, aggressive, nobody = reader.p_conservative(told)
+    inputs = np.array([[1.0, 0.0, 0.0, 0.0, 1.0], [1.0, 0.0, 2.0, 0.0, 1.0], [-1.0, 0.0, 0.0, 9.0, 1.0], [0.0] * 5])
+    sure, unsure, aggressive, nobody = reader.p_conservative(inputs)
     assert sure > unsure > 0.5 > aggressive
     assert np.isnan(nobody)
 
@@ -170,8 +170,8 @@ def test_a_gif_runs_in_real_time(tmp_path: Path) -> None:
 def test_an_mp4_has_every_step(tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="no .mp4 without the extra tint_sumo[video]")
     render_case(load_policy("always_go"), CASE, tmp_path / "film.mp4", task=TASK)
-    told = next(ffmpeg.read_frames(str(tmp_path / "film.mp4")))
-    assert (told["size"], told["fps"], told["pix_fmt"]) == (SIZE_PX, 10.0, "yuv420p(progressive)")
+    properties = next(ffmpeg.read_frames(str(tmp_path / "film.mp4")))
+    assert (properties["size"], properties["fps"], properties["pix_fmt"]) == (SIZE_PX, 10.0, "yuv420p(progressive)")
     frames, _ = ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))
     assert frames == 25 + 15  # the last one stays for a while
 
@@ -205,5 +205,5 @@ def test_gymnasiums_videos(scene: str, tmp_path: Path) -> None:
         env.step(0)
     env.close()
     (file,) = tmp_path.glob("*.mp4")
-    told = next(ffmpeg.read_frames(str(file)))
-    assert (told["fps"], told["pix_fmt"]) == (10.0, "yuv420p(progressive)")  # what every player plays
+    properties = next(ffmpeg.read_frames(str(file)))
+    assert (properties["fps"], properties["pix_fmt"]) == (10.0, "yuv420p(progressive)")  # what every player plays

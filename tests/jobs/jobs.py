@@ -42,7 +42,7 @@ class FileJob:
 
     @property
     def tries(self) -> int:
-        """How often it was begun."""
+        """Number of times that it was begun."""
         return int(self.path("tries").read_text()) if self.path("tries").exists() else 0
 
     def is_done(self) -> bool:
@@ -101,7 +101,7 @@ class CountJob:
 
     @property
     def begins(self) -> list[int]:
-        """With which numbers its runs began, as far as they have told."""
+        """Numbers with which its runs began, as far as they are known."""
         return sorted(int(file.name.removeprefix("from-")) for file in (self.out / self.name).glob("from-*"))
 
     def is_done(self) -> bool:

@@ -49,7 +49,7 @@ def rendered(width: int) -> list[str]:
     return [line.rstrip() for line in shown.get().splitlines()]
 
 
-# What is shown
+# Lines and table
 
 
 def test_a_wide_table_has_a_line_for_each_job_and_one_for_all() -> None:
@@ -110,7 +110,7 @@ def test_a_log_has_a_line_for_each_begin_and_end_and_one_a_minute_for_all() -> N
             table.report(name, Progress(second, 200, "step", {"success": 0.5}))
         table.refresh()
     table.end(TRAIN)
-    table.end(TRAITS, "98% of windows told apart")
+    table.end(TRAITS, "98% of windows right")
     lines = file.getvalue().splitlines()
     assert lines[:2] == [f"{TRAIN}: begins", "traits vae: begins"]
     assert len(lines) == 2 + 3 + 2
@@ -121,7 +121,7 @@ def test_a_log_has_a_line_for_each_begin_and_end_and_one_a_minute_for_all() -> N
     )
     assert lines[-2:] == [
         f"{TRAIN}: success 50% (3 min)",
-        "traits vae: 98% of windows told apart (3 min)",
+        "traits vae: 98% of windows right (3 min)",
     ]
 
 
@@ -145,7 +145,7 @@ def test_a_single_job_shows_nothing_before_its_first_report(capsys: pytest.Captu
 
 
 def see(process: "subprocess.Popen[bytes]", terminal: int, until: str = "") -> str:
-    """What a process shows until it matches, or until its end."""
+    """Return the output of a process until it matches, or until its end."""
     seen = ""
     while not (until and re.search(until, seen)):
         piece = look(terminal, PATIENCE_S)

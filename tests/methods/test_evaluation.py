@@ -88,20 +88,20 @@ def test_the_state_is_carried_and_episode_starts_are_told() -> None:
 
 def test_the_environment_is_closed_and_progress_told() -> None:
     made: list[VecEnv] = []
-    told: list[Progress] = []
+    reports: list[Progress] = []
 
     def make(num_envs: int) -> VecEnv:
         made.append(make_venv(num_envs))
         return made[-1]
 
-    found = evaluate(AlwaysGo(), make, 5, 0, batch=4, report=told.append)
+    found = evaluate(AlwaysGo(), make, 5, 0, batch=4, report=reports.append)
     evaluate(
         AlwaysGo(), partial(SceneVecEnv, settings=TaskSettings(backend="libsumo")), 1, 0
     )  # refused if libsumo were still busy
     assert [venv.num_envs for venv in made] == [4]
-    assert [(one.done, one.total, one.unit) for one in told] == [(done, 5, "case") for done in range(1, 6)]
-    assert all(set(one.measures) == {"success", "collision"} for one in told)
-    assert told[-1].measures == {name: found.rate(name).value for name in ("success", "collision")}
+    assert [(one.done, one.total, one.unit) for one in reports] == [(done, 5, "case") for done in range(1, 6)]
+    assert all(set(one.measures) == {"success", "collision"} for one in reports)
+    assert reports[-1].measures == {name: found.rate(name).value for name in ("success", "collision")}
 
 
 def test_summary() -> None:

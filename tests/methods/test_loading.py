@@ -275,7 +275,7 @@ def test_a_folder_of_nothing_but_malicious_files_never_runs_code(tmp_path: Path,
 
 
 def test_the_zip_bomb_is_live(run: Path, tmp_path: Path) -> None:
-    """What the tests above rely on, and why permission is asked for."""
+    """Show that the files of the tests above are dangerous, which is why permission is asked for."""
     (run / "policy.zip").write_bytes(bomb("stable-baselines3", tmp_path / "marker"))
     refused(run / "policy.zip")
     assert not (tmp_path / "marker").exists()

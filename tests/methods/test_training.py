@@ -61,7 +61,7 @@ def interrupt_at(steps: int) -> Report:
 
 
 def files(out: Path) -> list[str]:
-    """What a user sees in a folder, apart from the log."""
+    """Return the files of a folder, apart from the log."""
     return sorted(path.name for path in out.glob("[!.]*") if path.name != "tensorboard")
 
 
@@ -74,7 +74,7 @@ def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
 
 
 def observed(source_of: Path, num_envs: int = 16) -> Any:
-    """What a trained policy sees at the beginning of some episodes."""
+    """Return observations of a trained policy at the beginning of some episodes."""
     venv = load_policy(source_of).make_venv(num_envs, TaskSettings(p_conservative=0.4))
     venv.seed(7)
     observation = venv.reset()
@@ -82,16 +82,16 @@ def observed(source_of: Path, num_envs: int = 16) -> Any:
     return observation
 
 
-# What a run leaves
+# Files of a run
 
 
 def test_a_run_leaves_a_policy_its_card_its_snapshots_and_its_curve(tmp_path: Path, brief: PpoSettings) -> None:
     out = tmp_path / "run"
-    told: list[Progress] = []
-    policy = train_policy("no_labels", Mix(0.25, 0.5), 250, 3, out, settings=brief, report=told.append)
+    reports: list[Progress] = []
+    policy = train_policy("no_labels", Mix(0.25, 0.5), 250, 3, out, settings=brief, report=reports.append)
     assert policy == out / "policy.safetensors"
-    assert [one.done for one in told] == [0, 64, 128, 192, 250], "rollouts have 64 steps"
-    assert all((one.total, one.unit) == (250, "step") for one in told)
+    assert [one.done for one in reports] == [0, 64, 128, 192, 250], "rollouts have 64 steps"
+    assert all((one.total, one.unit) == (250, "step") for one in reports)
     card = json.loads((out / "policy.json").read_text())
     assert (card["method"], card["p_conservative"], card["steps"], card["seed"]) == ("no_labels", [0.25, 0.5], 250, 3)
     assert card["settings"]["n_steps"] == 16
@@ -103,14 +103,14 @@ def test_a_run_leaves_a_policy_its_card_its_snapshots_and_its_curve(tmp_path: Pa
 
 
 def test_the_log_and_the_curve_tell_the_outcomes_of_recent_episodes(tmp_path: Path, brief: PpoSettings) -> None:
-    told: list[Progress] = []
-    train_policy("oracle", Mix(0.4), 256, 0, tmp_path, settings=brief, report=told.append)
+    reports: list[Progress] = []
+    train_policy("oracle", Mix(0.4), 256, 0, tmp_path, settings=brief, report=reports.append)
     curve = pd.read_csv(tmp_path / CURVE_FILE)
     assert list(curve) == ["decisions", "success", "timeout", "collision"]
     assert curve["decisions"].tolist() == [64, 128, 192, 256]
     assert (curve[["success", "timeout", "collision"]].sum(axis=1) == 1.0).all()
     assert (curve["timeout"] == 1.0).all(), "episodes of 0.8 s end by their time limit"
-    assert [one.measures for one in told] == [{}, *[{"success": 0.0, "collision": 0.0}] * 4]
+    assert [one.measures for one in reports] == [{}, *[{"success": 0.0, "collision": 0.0}] * 4]
     assert list((tmp_path / "tensorboard").iterdir())
 
 
@@ -191,9 +191,9 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, brief: PpoSetti
         load_policy(out)
     assert load_policy(out / "policy-25").p_conservative == Mix(0.4)
     kept = (out / "policy-25.safetensors").stat().st_mtime_ns
-    told: list[Progress] = []
-    train_policy("oracle", Mix(0.4), 512, 0, out, settings=brief, report=told.append)
-    assert [one.done for one in told] == [192, 256, 320, 384, 448, 512], "what nothing was learnt from is repeated"
+    reports: list[Progress] = []
+    train_policy("oracle", Mix(0.4), 512, 0, out, settings=brief, report=reports.append)
+    assert [one.done for one in reports] == [192, 256, 320, 384, 448, 512], "what nothing was learnt from is repeated"
     assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
     assert (out / "policy-25.safetensors").stat().st_mtime_ns == kept
     assert pd.read_csv(out / CURVE_FILE)["decisions"].tolist() == [64 * rollout for rollout in range(1, 9)]
@@ -305,9 +305,9 @@ def test_a_killed_run_leaves_whole_files_and_goes_on(tmp_path: Path) -> None:
         done = json.loads(checkpoint.metadata()["state"])["decisions"]
     assert runs.STEPS / 4 <= done < runs.STEPS
     assert pd.read_csv(out / CURVE_FILE)["decisions"].is_monotonic_increasing
-    told: list[Progress] = []
-    train_policy(runs.METHOD, Mix(0.4), runs.STEPS, runs.SEED, out, settings=runs.SETTINGS, report=told.append)
-    assert told[0].done == done
+    reports: list[Progress] = []
+    train_policy(runs.METHOD, Mix(0.4), runs.STEPS, runs.SEED, out, settings=runs.SETTINGS, report=reports.append)
+    assert reports[0].done == done
     assert files(out) == [CURVE_FILE, *SNAPSHOTS, "policy.json", "policy.safetensors", "run.json"]
     assert not list(out.rglob("*.partial"))
     assert pd.read_csv(out / CURVE_FILE)["decisions"].tolist() == list(range(64, runs.STEPS + 1, 64))
@@ -531,7 +531,7 @@ def test_a_trait_model_that_cannot_stream_is_refused(tmp_path: Path, tiny: PpoSe
     assert not (tmp_path / "run").exists()
 
 
-# What the methods differ in
+# Differences between the methods
 
 
 def test_without_attention_there_are_no_scores(tmp_path: Path, tiny: PpoSettings, encoders: Path) -> None:

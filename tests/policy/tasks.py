@@ -20,7 +20,7 @@ STREET_WITH_TRAITS = spaces.Dict({**STREET.spaces, "traits": box(12, 2)})
 
 
 class FakeVecEnv(VecEnv):
-    """What a VecEnv must have and no test here looks at."""
+    """Methods that a VecEnv must have, and that no test here uses."""
 
     def close(self) -> None: ...
 

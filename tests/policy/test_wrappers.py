@@ -52,7 +52,7 @@ def test_at_least_one_step() -> None:
 
 
 def test_every_step_is_shown_until_an_episode_s_very_end() -> None:
-    """What is shown at the end is the end itself, not the beginning of the next episode."""
+    """The end is shown at the end, not the beginning of the next episode."""
     shown: list[tuple[Any, Any]] = []
     task = TaskSettings(time_limit_s=0.6)
     venv = policy_venv(2, OracleTraits(), [task], action_repeat=4, on_step=lambda *step: shown.append(step))

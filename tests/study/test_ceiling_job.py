@@ -22,10 +22,10 @@ def test_there_is_a_ceiling_for_each_mix_of_the_training_s_conditions(tmp_path: 
     tests = (budgets.Trials((Conditions(Mix(0.1)), *elsewhere), 10), budgets.Trials((Conditions(Mix(0.0)),), 5))
     job = CeilingJob(tests, tmp_path)
     assert not job.is_done()
-    told: list[Progress] = []
-    line = job.run(told.append)
+    reports: list[Progress] = []
+    line = job.run(reports.append)
     assert job.is_done()
-    assert told == [Progress(0, 15, "case"), Progress(10, 15, "case")]
+    assert reports == [Progress(0, 15, "case"), Progress(10, 15, "case")]
     expected = ceiling(Mix(0.1), 10, REPORTED_SET)
     assert read_ceilings(tmp_path) == {0.1: expected, 0.0: 0.0}
     assert line == f"P 0.1: {expected:.1%}, P 0: 0.0%"

@@ -1,4 +1,4 @@
-"""What the figures show, and that they are pictures."""
+"""Contents of the figures, and that they are pictures."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -88,10 +88,10 @@ def test_a_training_takes_the_study_s_trait_model(tmp_path: Path, brief: PpoSett
     for suffix in (".json", ".safetensors"):
         content = (encoders / f"vae{suffix}").read_bytes()
         (tmp_path / "traits" / "vae" / f"model{suffix}").write_bytes(content)
-    told: list[Progress] = []
+    reports: list[Progress] = []
     job = TrainJob("vae", Mix(0.4), 0, brief, False, tmp_path)
-    assert job.run(told.append) == "", "the last report says what came out"
-    assert [(one.done, one.total) for one in told] == [(0, 128), (64, 128), (128, 128)]
+    assert job.run(reports.append) == "", "the last report says what came out"
+    assert [(one.done, one.total) for one in reports] == [(0, 128), (64, 128), (128, 128)]
     assert (job.folder / "traits.safetensors").read_bytes() == (encoders / "vae.safetensors").read_bytes()
 
 
@@ -108,10 +108,10 @@ def test_a_rule_is_tested_on_the_same_cases_as_everyone_but_not_after_parts_of_a
     other, part = Conditions(ALL_MIXES, tau_s=1.5), Conditions(Mix(0.4), percent=25)
     job = make_job("always_go", None, tmp_path, ((Conditions(Mix(0.4)), part), 4), ((other,), 3))
     assert not job.is_done()
-    told: list[Progress] = []
-    assert job.run(told.append).startswith("success ")
+    reports: list[Progress] = []
+    assert job.run(reports.append).startswith("success ")
     assert job.is_done()
-    assert [(one.done, one.total) for one in told] == [(done, 7) for done in range(1, 8)]
+    assert [(one.done, one.total) for one in reports] == [(done, 7) for done in range(1, 8)]
     result = Result.read(job.result_file)
     assert (result.method, result.origin, result.mix) == ("always_go", GIVEN, None)
     assert [(one.conditions, len(one.evaluation.cases)) for one in result.tested] == [

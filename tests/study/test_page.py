@@ -49,7 +49,7 @@ def decoded(name: str, column: list[int]) -> list[float]:
     return [np.nan if number == MISSING else number * UNITS[name] for number in np.cumsum(column).tolist()]
 
 
-# What is chosen
+# Choice of policies and cases
 
 
 def test_every_policy_has_failures_of_both_kinds_and_some_successes_among_the_cases() -> None:
@@ -85,7 +85,7 @@ def test_the_middle_mix_that_most_policies_met_is_shown_with_first_seeds() -> No
     assert only_others.conditions == Conditions(ALL_MIXES, 0.1)
 
 
-# What is recorded
+# Recordings
 
 
 def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -> Moment:
@@ -93,7 +93,7 @@ def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -
     boxes = new_boxes(2, 5.0, 2.0)
     boxes[0] = (x_m, -2.5, 0.0, 1.0, 5.0, 2.0)
     boxes[1] = (8.0, 1.25, -1.0, 0.0, 5.0, 2.0)
-    told = np.array([[2.0], [0.0]])
+    inferred = np.array([[2.0], [0.0]])
     common = Moment(
         time_s=0.1,
         ego=boxes[1],
@@ -105,7 +105,7 @@ def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -
         boxes=boxes,
         brakes=np.array([False, True]),
         traits=np.array([0, 1]),
-        observed_traits=told,
+        observed_traits=inferred,
         attention=np.array([0.75, 0.25]),
         claimed=np.array([False, True]),
         desired_mps=3.0,
@@ -137,7 +137,7 @@ def test_an_episode_survives_its_small_numbers() -> None:
     assert decoded("heading_deg", seventh["heading_deg"]) == [90.0, 90.0]
     assert decoded("attention", seventh["attention"]) == pytest.approx([0.75, 0.75])
     assert decoded("p_conservative", seventh["p_conservative"]) == pytest.approx([0.88, 0.88])
-    assert np.isnan(decoded("p_conservative", second["p_conservative"])).all()  # nothing was told of it
+    assert np.isnan(decoded("p_conservative", second["p_conservative"])).all()  # nothing was inferred
     assert decoded("brakes", second["brakes"]) == [1.0, 1.0]
     ego = episode["ego"]
     np.testing.assert_allclose(decoded("value", ego["value"]), [np.nan, -1.25, -1.25])
@@ -179,7 +179,7 @@ def test_damaged_recordings_are_named_in_one_line(tmp_path: Path) -> None:
         read_episodes(tmp_path / "one.json")
 
 
-# What is drawn
+# Drawings
 
 
 @pytest.mark.parametrize("name", sorted(SCENES))

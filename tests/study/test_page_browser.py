@@ -81,7 +81,7 @@ class Opened:
         return dict(zip(names, values, strict=True))
 
     def places(self, pane: int = 0) -> list[str]:
-        """Where vehicles are drawn, the ego last."""
+        """Return the positions at which vehicles are drawn, the ego last."""
         found = self.page.locator(".pane").nth(pane).locator("g:last-of-type > g[transform]")
         return [str(one.get_attribute("transform")) for one in found.all()]
 

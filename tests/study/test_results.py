@@ -124,7 +124,7 @@ def test_results_with_a_damaged_part_are_named(study: Path, change: dict[str, An
 
 
 def damage(study: Path, text: str) -> None:
-    """Write ``text`` in place of a result, and see that it is told in one line and that no report is made."""
+    """Write ``text`` in place of a result, and see that the error is one line and that no report is made."""
     file = study / RESULTS / "1.json"
     file.write_text(text)
     with pytest.raises(InputError, match=r"1\.json is damaged.*") as refusal:

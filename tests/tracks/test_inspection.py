@@ -1,4 +1,4 @@
-"""What cannot be in traffic is counted and named."""
+"""Values that are impossible in traffic are counted and named."""
 
 import json
 from pathlib import Path

@@ -69,7 +69,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """What a user sees in a folder, apart from the log, which has the time."""
+    """Return the files of a folder, apart from the log, which contains the time."""
     return {file.name: file.read_bytes() for file in folder.glob("[!.]*") if file.is_file()}
 
 

@@ -1,4 +1,4 @@
-"""What every trait method keeps, whatever it learns."""
+"""Promises of every trait method, whatever it learns."""
 
 import math
 from dataclasses import replace

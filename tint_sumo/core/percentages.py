@@ -8,7 +8,7 @@ def percent(share: float, digits: int = 1) -> str:
     """Return a share of 1 in percent, without the sign, rounded half up: 0.985 is "98.5", and "99" without digits.
 
     Only a share of 1 reads 100, and only one of 0 reads 0: 0.9996 is ">99.9" and 0.0002 is "<0.1".
-    What is not known (NaN) is "-".
+    An unknown share (NaN) is "-".
 
     Args:
         share: in 0 to 1.

@@ -12,7 +12,7 @@ _LATER_PARAMETER = re.compile(rf"&{_CREDENTIAL}", re.IGNORECASE)
 def redact(text: str) -> str:
     """Return the text with its URLs freed of user names, passwords and query parameters that hold credentials.
 
-    What is left of a URL is valid: with credentials from the environment it leads to the same folder.
+    The rest of a URL is valid: with credentials from the environment it leads to the same folder.
     """
     text = _LATER_PARAMETER.sub("", _USER.sub("", text))
     return _FIRST_PARAMETER.sub(lambda found: "?" if found[1] else "", text)

@@ -1,7 +1,7 @@
 """The methods of the study. A new one is one entry here, and its rule or trait source.
 
-Help texts, tables, figures, the study's budgets and the list of shipped policies follow from the entries. What an entry
-needs is imported when it is used: help texts must not wait for torch.
+Help texts, tables, figures, the study's budgets and the list of shipped policies follow from the entries. Modules
+that an entry needs are imported when it is used: help texts must not wait for torch.
 """
 
 from collections.abc import Callable, Iterable

@@ -31,7 +31,7 @@ from tint_sumo.policy.loss import Decisions, ppo_loss
 from tint_sumo.policy.network import GruPolicy
 
 _DEFAULTS = PpoSettings()
-# What Stable-Baselines3, torch and pickle raise for damaged files and for files of other models.
+# Exceptions of Stable-Baselines3, torch and pickle for damaged files and for files of other models.
 _UNREADABLE = (
     *(ValueError, LookupError, TypeError, AttributeError, ImportError, RuntimeError, AssertionError, EOFError),
     *(zipfile.BadZipFile, zlib.error, pickle.UnpicklingError),

@@ -103,9 +103,10 @@ class ActionRepeat(VecEnvWrapper):
     An episode that ends within a decision ends the decision; the next episode then waits, with desired speed 0, for
     the rest of it. The controller and its safety check go on working at every step.
 
-    It differs from the environments' ``decision_s`` in two ways, and trainings depend on both. What it wraps goes step
-    by step, so that traits are inferred at each of them; an environment with ``decision_s`` shows only what is there
-    after the decision. And with ``decision_s`` the next episode begins when the decision is over, and does not wait.
+    It differs from the environments' ``decision_s`` in two ways, and trainings depend on both. The wrapped environments
+    go step by step, so that traits are inferred at each of them; an environment with ``decision_s`` shows only the
+    state after the decision. And with ``decision_s`` the next episode begins when the decision is over, and does not
+    wait.
 
     Args:
         venv: the environments.

@@ -19,9 +19,9 @@ LOG_STD_RANGE = (-4.0, 3.0)  # limits for predicted features: the density of a p
 class CrossWindow(TraitModel):
     """GRU encoder, and a GRU decoder that follows ANOTHER window of the driver and predicts its next displacements.
 
-    A trait is what stays the same from one window of a driver to the next. What happens in a window alone, such as the
-    noise of its positions or where the leader brakes, does not help to predict another one, so the latent drops it,
-    while a latent that must reconstruct its window has to keep it.
+    A trait is what stays the same from one window of a driver to the next. Events in a single window, such as the
+    noise of its positions or where the leader brakes, do not help to predict another one, so the latent drops them,
+    while a latent that must reconstruct its window has to keep them.
 
     The loss is the negative log-likelihood of the other window B given this one, A, -log E_{z ~ q(z|A)} p(B | z),
     estimated with ``SAMPLES`` latents. It is a proper score of the predictive distribution, so that the variance of

@@ -34,7 +34,7 @@ from tint_sumo.study.jobs import label, policy_folder, policy_path
 EPISODES = "episodes"  # folder of the recorded episodes in a study's folder
 FORMAT = 2  # number of the files' format
 MISSING = -32768  # a column's number where a value is missing
-# What the numbers of each column are multiples of. A column holds the first number, then what each differs by.
+# Units that the numbers of each column are multiples of. A column holds the first number, then the differences.
 UNITS = {
     "x_m": 0.01,
     "y_m": 0.01,

@@ -8,11 +8,19 @@ import pandas as pd
 import pytest
 
 from tests.simulation.scenes import T
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Mix
 from tint_sumo.core.errors import InputError
-from tint_sumo.dataset.recorder import EPISODE_STEPS, EPISODES_PER_SHARD, record, simulate_episodes
+from tint_sumo.dataset.recorder import (
+    EPISODE_STEPS,
+    EPISODES_PER_SHARD,
+    Recording,
+    _simulations,
+    record,
+    simulate_episodes,
+)
 from tint_sumo.dataset.schema import DRIVERS, TRAJECTORIES, read_manifest
 from tint_sumo.simulation import SceneSimulation
+from tint_sumo.simulation.sumo import SumoLink
 
 WINDOWS = 3000  # one shard
 TWO_SHARDS = 5000
@@ -36,6 +44,29 @@ def two_shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def contents(folder: Path) -> dict[str, bytes]:
     """Every shard's files."""
     return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.glob("*/*"))}
+
+
+def test_a_shard_is_the_same_after_one_that_was_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clusters interrupt the shards that nobody needs any more, and their processes go on with other ones."""
+    recording = Recording(WINDOWS, Mix(0.5), None, 0, T)
+    expected = recording.simulate(0)
+    forget = SumoLink._forget
+    calls = 0
+
+    def interrupted_once(link: SumoLink, replica: int, slot: int) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 5:
+            raise KeyboardInterrupt
+        forget(link, replica, slot)
+
+    monkeypatch.setattr(SumoLink, "_forget", interrupted_once)
+    with pytest.raises(KeyboardInterrupt):
+        recording.simulate(1)
+    again = recording.simulate(0)
+    _simulations.clear()
+    for found, wanted in zip(again, expected, strict=True):
+        pd.testing.assert_frame_equal(found, wanted)
 
 
 def test_rows_are_what_sumo_reports() -> None:

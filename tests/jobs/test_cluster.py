@@ -115,8 +115,10 @@ def meanwhile(work: Callable[[], Any]) -> Iterator[None]:
     """Do some work in a thread while the block runs, and wait for its end; nodes can begin in the main thread only."""
     with ThreadPoolExecutor(1) as thread:
         future = thread.submit(work)
-        yield
-        future.result()
+        try:
+            yield
+        finally:  # the work's own error says more than that of a block that waited for it
+            future.result()
 
 
 def test_jobs_read_what_others_wrote_on_other_nodes(cluster: Executor, tmp_path: Path) -> None:

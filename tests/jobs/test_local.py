@@ -14,7 +14,7 @@ from tint_sumo.core.errors import InputError, JobError
 from tint_sumo.jobs import Local
 from tint_sumo.jobs.process import read_log
 
-PATIENCE_S = 300.0  # only where something hangs; slow machines need more than a minute to start nodes under load
+PATIENCE_S = 300.0  # slow machines need more than a minute to start nodes beside other work
 STATES = ("begins", "written")
 
 

@@ -1,6 +1,7 @@
 """Record the traffic without the ego (paper III-B) to Parquet, shard by shard."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -60,7 +61,8 @@ class Recording:
         return EPISODE_STEPS * self.played().step_s
 
     def simulate(self, shard: int) -> tuple[pd.DataFrame, pd.DataFrame]:
-        return simulate_episodes(_simulation(self.played()), self.seed, shard * EPISODES_PER_SHARD)
+        with _kept_simulation(self.played()) as simulation:
+            return simulate_episodes(simulation, self.seed, shard * EPISODES_PER_SHARD)
 
 
 def record(
@@ -101,12 +103,20 @@ def record(
 _simulations: dict[Scene, SceneSimulation] = {}  # of this process, at most one: libsumo runs no more
 
 
-def _simulation(scene: Scene) -> SceneSimulation:
-    """Return this process's simulation; starting another for every shard would cost more than recording it."""
+@contextmanager
+def _kept_simulation(scene: Scene) -> Iterator[SceneSimulation]:
+    """Give this process's simulation; starting another for every shard would cost more than recording it.
+
+    One that an error or an interrupt may have left half done is closed: a cluster's process goes on to the next shard.
+    """
     if scene not in _simulations:
         _simulations.clear()
         _simulations[scene] = SceneSimulation(EPISODES_PER_SHARD, scene, with_ego=False)
-    return _simulations[scene]
+    try:
+        yield _simulations[scene]
+    except BaseException:
+        _simulations.pop(scene).close()
+        raise
 
 
 def simulate_episodes(

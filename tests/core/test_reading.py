@@ -20,7 +20,7 @@ import pytest
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
 from tint_sumo.core.reading import open_file, read_file, require_file, require_zip
-from tint_sumo.dataset.fcd import read_fcd
+from tint_sumo.dataset.fcd_reader import read_fcd
 from tint_sumo.scenes.sumocfg import read_net
 
 # Commands that read FILE, or a folder with FILE in it.

@@ -2,7 +2,6 @@
 
 import gzip
 import random
-import subprocess
 import tracemalloc
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,11 +11,10 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import sumo
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
-from tint_sumo.dataset.fcd import read_fcd
+from tint_sumo.dataset.fcd_reader import read_fcd
 from tint_sumo.dataset.schema import TRAJECTORIES
 from tint_sumo.dataset.tracks import read_tracks
 
@@ -82,6 +80,43 @@ def test_with_the_network_leaders_are_seen_across_lanes(
     assert np.isnan(gaps(tracks(tmp_path, {0.0: seen, 0.1: seen}), "a")).all()
 
 
+def test_each_leader_has_the_length_of_its_vtype(tmp_path: Path) -> None:
+    """A bus without a length has that of its vClass, which SUMO knows; a type of one vehicle is that of all."""
+    (tmp_path / "vtypes.add.xml").write_text(
+        '<additional><vTypeDistribution id="mix"><vType id="short.1" length="3.5" probability="1"/>'
+        '</vTypeDistribution><vType id="bus" vClass="bus"/></additional>'
+    )
+    kinds = {"a": "DEFAULT_VEHTYPE", "b": "bus", "c": "short.1", "d": "bus@d"}
+    seen = [(vehicle, "e_0", 20.0 * number, 0.0) for number, vehicle in enumerate(kinds)]
+    text = fcd({0.0: seen, 0.1: seen})
+    for vehicle, kind in kinds.items():
+        text = text.replace(f'id="{vehicle}"', f'id="{vehicle}" type="{kind}"')
+    (tmp_path / "fcd.xml").write_text(text)
+    rows = read_tracks(tmp_path / "fcd.xml", vtypes_file=tmp_path / "vtypes.add.xml")
+    assert [gaps(rows, vehicle)[0] for vehicle in "abc"] == [8.0, 16.5, 8.0]
+    (tmp_path / "vtypes.add.xml").write_text('<additional><vType id="bus" length="-1"/></additional>')
+    with pytest.raises(InputError, match=r"SUMO refuses a vType of .*vtypes\.add\.xml"):
+        read_tracks(tmp_path / "fcd.xml", vtypes_file=tmp_path / "vtypes.add.xml")
+    (tmp_path / "vtypes.add.xml").write_text('<additional><vType id="bus"/></additional>')
+    with pytest.raises(InputError, match=r"vtypes\.add\.xml has no vType 'short.1'"):
+        read_tracks(tmp_path / "fcd.xml", vtypes_file=tmp_path / "vtypes.add.xml")
+    (tmp_path / "vtypes.add.xml").write_text("<additional><vType")
+    with pytest.raises(InputError, match=r"vtypes\.add\.xml is damaged"):
+        read_tracks(tmp_path / "fcd.xml", vtypes_file=tmp_path / "vtypes.add.xml")
+    (tmp_path / "fcd.xml").write_text(fcd({0.0: seen, 0.1: seen}))
+    with pytest.raises(InputError, match="lacks the vehicles' types"):
+        read_tracks(tmp_path / "fcd.xml", vtypes_file=tmp_path / "vtypes.add.xml")
+
+
+def test_a_long_leader_can_reach_back_from_the_lane_ahead(tmp_path: Path) -> None:
+    seen = [("a", "lower_in.0_0", 1.0, 0.0), ("b", "lower_out.0_0", 3.0, 0.0)]
+    text = fcd({0.0: seen, 0.1: seen})
+    (tmp_path / "fcd.xml").write_text(text.replace("<vehicle", '<vehicle type="rail"'))
+    (tmp_path / "v.rou.xml").write_text('<routes><vType id="rail" length="25"/></routes>')
+    rows = read_tracks(tmp_path / "fcd.xml", net_file=NET, vtypes_file=tmp_path / "v.rou.xml")
+    assert gaps(rows, "a") == [16.5 - 1.0 + 12.0 + 3.0 - 25.0] * 2
+
+
 # Offsets
 
 
@@ -129,13 +164,6 @@ def test_who_vanishes_comes_back_on_a_new_track(tmp_path: Path) -> None:
     np.testing.assert_allclose(rows["time_s"], [0.0, 0.1, 0.2, 0.5, 0.6])
 
 
-def test_persons_are_left_out(tmp_path: Path) -> None:
-    person = '<person id="p" x="1" y="1" angle="0" speed="1" pos="1" edge="e"/>'
-    text = fcd({0.1 * step: [("a", "e_0", 0.1 * step, 1.0)] for step in range(3)})
-    (tmp_path / "fcd.xml").write_text(text.replace("</timestep>", f"{person}</timestep>"))
-    assert read_tracks(tmp_path / "fcd.xml")["vehicle"].tolist() == ["a"] * 3
-
-
 # Bad input
 
 
@@ -170,7 +198,7 @@ def test_what_is_no_floating_car_data_is_refused(tmp_path: Path, text: str, mess
 def test_a_table_without_a_column_or_a_value_is_refused(tmp_path: Path) -> None:
     file, names = tmp_path / "fcd.csv", "timestep_time;vehicle_id;vehicle_pos;vehicle_speed"
     file.write_text(f"{names}\n0.00;a;1.00;1.00\n")
-    with pytest.raises(InputError, match="vehicle_lane"):
+    with pytest.raises(InputError, match="lacks 'lane'; run SUMO without"):
         read_tracks(file)
     file.write_text(f"{names};vehicle_lane\n0.00;;;;\n0.10;a;;1.00;e_0\n")
     with pytest.raises(InputError, match="without one of time, id, lane, pos, speed"):
@@ -246,23 +274,3 @@ def test_a_dataset_is_read_from_its_folder_part_and_shard(dataset: Path) -> None
     pd.testing.assert_frame_equal(read_tracks(dataset / TRAJECTORIES), whole)
     one = read_tracks(next(iter(sorted((dataset / TRAJECTORIES).iterdir()))))
     pd.testing.assert_frame_equal(one, whole[: len(one)], check_categorical=False)
-
-
-def test_what_sumo_writes_is_the_same_in_all_formats(tmp_path: Path) -> None:
-    names = ("fcd.xml", "fcd.xml.gz", "fcd.csv", "fcd.csv.gz", "fcd.parquet")
-    for name in names:
-        command = [f"{sumo.SUMO_HOME}/bin/sumo", "-c", str(NET.parent / "tint.sumocfg"), "--end", "30"]
-        subprocess.run([*command, "--fcd-output", str(tmp_path / name)], check=True, capture_output=True)
-    expected = read_fcd(tmp_path / names[0])
-    assert len(expected) > 1000
-    for name in names[1:]:
-        found = read_fcd(tmp_path / name)
-        assert list(found) == list(expected)
-        for column in found:
-            if found[column].dtype == "category":
-                assert found[column].astype(str).tolist() == expected[column].astype(str).tolist()
-            else:
-                np.testing.assert_allclose(found[column], expected[column], atol=0.0051)
-    rows = read_tracks(tmp_path / "fcd.xml.gz", net_file=NET)
-    assert rows.groupby("vehicle", observed=True)["track"].nunique().eq(1).all()
-    assert rows["gap_m"].min() > 0.5

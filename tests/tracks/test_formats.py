@@ -288,7 +288,7 @@ def test_commonroad_without_sense_is_refused(tmp_path: Path, old: str, new: str,
         read_tracks(file)
 
 
-def test_floating_car_data_between_commas_names_the_columns(tmp_path: Path) -> None:
-    write_text(tmp_path / "fcd.csv", "timestep_time,vehicle_x\n0,1\n")
-    with pytest.raises(InputError, match=r"lacks the columns timestep_time, vehicle_id, .*, between semicolons"):
+def test_floating_car_data_without_all_columns_names_them(tmp_path: Path) -> None:
+    write_text(tmp_path / "fcd.csv", "timestep_time,vehicle_id,vehicle_speed,vehicle_x\n0,a,1,1\n")
+    with pytest.raises(InputError, match=r"fcd\.csv lacks 'type', 'y', 'angle'"):
         read_tracks(tmp_path / "fcd.csv")

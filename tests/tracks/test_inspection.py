@@ -123,7 +123,7 @@ def test_the_command_reports_draws_and_prints_json(tmp_path: Path, capsys: pytes
     [
         (["missing.csv"], "no file"),
         (["{file}", "--figure", "{file}"], "must end in"),
-        (["{file}", "--format", "fcd_geo"], "vehicle_angle"),
+        (["{file}", "--format", "fcd_geo"], "names no time in its first line"),
         (["{file}", "--format", "unknown"], "unknown format 'unknown'"),
     ],
 )

@@ -29,6 +29,12 @@ _NOISE = optional(
 )
 _NET = optional("FILE", "Network of the scenario (.net.xml); without it no leader beyond the end of a lane is seen.")
 
+_VTYPES = optional(
+    "FILE",
+    "Route file, additional file or .sumocfg with the vehicles' vTypes, whose lengths are taken.",
+    "--vehicle-length for all",
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainTraits(Command):
@@ -141,7 +147,8 @@ class InferTraits(Command):
     """Table to write, .csv or .parquet."""
     net: Annotated[Path | None, _NET] = None
     vehicle_length: Annotated[float, Range(0.5, 30.0)] = 5.0
-    """Length of the vehicles in floating-car data, m."""
+    """Length of all vehicles in floating-car data, m."""
+    vtypes: Annotated[Path | None, _VTYPES] = None
 
     def run(self) -> Outcome:
         from tint_sumo.traits.inference import OUTSIDE, SUFFIXES, infer_traits, write_table
@@ -150,7 +157,9 @@ class InferTraits(Command):
             raise InputError(f"{self.out} holds the data themselves; choose another --out")
         require_output_file(self.out, SUFFIXES)
         use_one_thread()
-        table = infer_traits(self.fcd, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length)
+        table = infer_traits(
+            self.fcd, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length, vtypes_file=self.vtypes
+        )
         write_table(table, self.out)
         outside = float(table[OUTSIDE].mean()) if OUTSIDE in table else None
         content = {"out": str(self.out), "windows": len(table), "vehicles": int(table["vehicle"].nunique())}

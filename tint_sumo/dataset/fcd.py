@@ -1,4 +1,4 @@
-"""SUMO's floating-car data: recorded trajectories are written as such, and any run's are read.
+"""Recorded trajectories as SUMO's floating-car data; ``tint_sumo.dataset.fcd_reader`` reads those of any run.
 
 ``write_fcd`` writes what ``sumo --fcd-output FILE --fcd-output.acceleration`` writes of the same traffic in the network
 that ``tint-sumo net`` builds, apart from three things. Episodes are runs that follow each other at full minutes, so
@@ -6,35 +6,23 @@ that time increases along a file and from file to file. Vehicle ids are ``EPISOD
 the type is SUMO's default one for all: the drivers' vTypes would give the trait away; they are in ``drivers/`` with the
 labels.
 
-``read_fcd`` reads XML, CSV and Parquet, which ``sumo --fcd-output FILE`` writes by the suffix of FILE, the first two
-gzipped if it ends in .gz.
-
 Format: https://sumo.dlr.de/docs/Simulation/Output/FCDOutput.html
 """
 
 import gzip
-import zlib
-from array import array
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
-from xml.parsers import expat
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import whole_file
-from tint_sumo.core.reading import TABLE_BYTES, require_file, unpacked
-from tint_sumo.dataset.schema import require_table
 from tint_sumo.scenes.geometry import new_boxes, place
 from tint_sumo.scenes.layout import Layout
 
 EPISODE_PERIOD_S = 60.0
 VEHICLE_TYPE = "DEFAULT_VEHTYPE"
-_AGAIN = "write it again with sumo --fcd-output"
 _DECIMALS = 2  # SUMO's own precision
 _GZIP_LEVEL = 6
 _HEADER = """<?xml version="1.0" encoding="UTF-8"?>
@@ -44,26 +32,6 @@ _HEADER = """<?xml version="1.0" encoding="UTF-8"?>
 <fcd-export xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" \
 xsi:noNamespaceSchemaLocation="http://sumo.dlr.de/xsd/fcd_file.xsd">
 """
-
-
-@dataclass(frozen=True)
-class FcdColumns:
-    """Columns to read, with SUMO's names of the vehicles' attributes in the order of the answer."""
-
-    numbers: Mapping[str, str]  # attribute: name of the column
-    ids: Mapping[str, str]
-
-    @property
-    def names(self) -> Mapping[str, str]:
-        """Names of the columns by those in SUMO's tables."""
-        attributes = {f"vehicle_{attribute}": name for attribute, name in {**self.ids, **self.numbers}.items()}
-        return {"timestep_time": "time_s", **attributes}
-
-
-ON_LANES = FcdColumns({"pos": "pos_m", "speed": "speed_mps"}, {"id": "vehicle", "lane": "lane"})
-POSES = FcdColumns(
-    {"x": "x", "y": "y", "angle": "angle_deg", "speed": "speed_mps"}, {"id": "vehicle", "type": "vehicle_class"}
-)
 
 
 def write_fcd(rows: pd.DataFrame, file: Path, layout: Layout) -> None:
@@ -138,115 +106,3 @@ def _decimals(values: NDArray[np.float64]) -> NDArray[np.object_]:
     different, index = np.unique(np.rint(values * scale).astype(np.int64), return_inverse=True)
     texts: NDArray[np.object_] = np.array([f"{value / scale:.{_DECIMALS}f}" for value in different], object)[index]
     return texts
-
-
-def read_fcd(file: Path, columns: FcdColumns = ON_LANES) -> pd.DataFrame:
-    """Return the columns time_s and those asked for; ids are categories, pos_m is that of the front along the lane.
-
-    XML is read in a stream: memory grows by 40 bytes for each vehicle and timestep. Persons are left out.
-
-    Raises:
-        InputError: no such file, a damaged one or none with floating-car data, a vehicle lacks an attribute, or there
-            is no vehicle.
-    """
-    require_file(file, "floating-car data", TABLE_BYTES)
-    try:
-        rows = _read_table(file, columns) if {".csv", ".parquet"} & set(file.suffixes) else _read_xml(file, columns)
-    except InputError:
-        raise
-    except expat.ExpatError as error:
-        raise InputError(f"{file} is not whole XML ({error}); {_AGAIN}") from None
-    except (EOFError, gzip.BadGzipFile, zlib.error, ValueError, KeyError) as error:  # pyarrow's are ValueErrors
-        raise InputError(f"{file} is damaged ({str(error).splitlines()[0]}); {_AGAIN}") from None
-    if rows.empty:
-        raise InputError(f"{file} has no vehicles; write it again with traffic in it")
-    if rows.isna().any(axis=None) or np.isinf(rows.select_dtypes("number")).any(axis=None):
-        attributes = ", ".join([*columns.ids, *columns.numbers])
-        raise InputError(f"{file} has a vehicle without one of time, {attributes}; {_AGAIN}")
-    return rows
-
-
-def _read_table(file: Path, columns: FcdColumns) -> pd.DataFrame:
-    names = columns.names
-    ids = {name: column for name, column in names.items() if column in columns.ids.values()}
-    if file.suffix == ".parquet":
-        require_table(file, "floating-car data")
-        rows = pd.read_parquet(file, columns=list(names), read_dictionary=list(ids))  # ids once each
-    else:
-        with file.open("rb") as raw:
-            rows = pd.read_csv(unpacked(raw), sep=";", usecols=names.__contains__, dtype=dict.fromkeys(ids, str))
-        if missing := [name for name in names if name not in rows]:
-            raise InputError(f"{file} lacks the columns {', '.join(missing)}, between semicolons; {_AGAIN}")
-    rows = rows.rename(columns=names)[list(names.values())]
-    rows = rows[rows["vehicle"].notna()]  # an empty timestep has a row, too
-    kinds = {name: "category" if name in ids.values() else "float64" for name in names.values()}
-    rows = rows.astype(kinds).reset_index(drop=True)
-    for name in ids.values():
-        column = rows[name].cat.remove_unused_categories()
-        rows[name] = column.cat.reorder_categories(sorted(column.cat.categories))
-    return rows
-
-
-def _read_xml(file: Path, columns: FcdColumns) -> pd.DataFrame:
-    reader = _XmlReader(file, columns)
-    with file.open("rb") as raw:
-        reader.read(unpacked(raw))
-    return reader.rows()
-
-
-class _XmlReader:
-    """Reader of XML that keeps numbers, and each id of a vehicle or lane once."""
-
-    def __init__(self, file: Path, columns: FcdColumns) -> None:
-        self._file = file
-        self._columns = columns
-        self._parser = expat.ParserCreate()
-        self._parser.StartElementHandler = self._check_root
-        self._time_s = np.nan
-        self._times_s = array("d")
-        self._numbers = {attribute: array("d") for attribute in columns.numbers}
-        self._codes = {attribute: array("l") for attribute in columns.ids}
-        self._ids: dict[str, dict[str, int]] = {attribute: {} for attribute in columns.ids}
-
-    def read(self, stream: IO[bytes]) -> None:
-        self._parser.ParseFile(stream)
-
-    def rows(self) -> pd.DataFrame:
-        columns: dict[str, Any] = {"time_s": np.asarray(self._times_s)}
-        for attribute, name in self._columns.ids.items():
-            known = pd.Index(list(self._ids[attribute]), dtype=object)
-            columns[name] = pd.Categorical.from_codes(np.asarray(self._codes[attribute]), known)
-        for attribute, name in self._columns.numbers.items():
-            columns[name] = np.asarray(self._numbers[attribute])
-        return pd.DataFrame(columns)
-
-    def _check_root(self, name: str, _: Mapping[str, str]) -> None:
-        if name != "fcd-export":
-            raise InputError(f"{self._file} holds <{name}>, not <fcd-export>; give what sumo --fcd-output wrote")
-        self._parser.StartElementHandler = self._start
-
-    def _start(self, name: str, attributes: Mapping[str, str]) -> None:
-        try:
-            if name == "timestep":
-                self._time_s = float(attributes["time"])
-            elif name == "vehicle":
-                self._append(attributes)
-        except KeyError as missing:
-            raise InputError(
-                f"{self._here()} lacks {missing}; write the file without --fcd-output.attributes"
-            ) from None
-        except ValueError as error:
-            raise InputError(f"{self._here()} is damaged ({error}); {_AGAIN}") from None
-
-    def _append(self, attributes: Mapping[str, str]) -> None:
-        values = {attribute: float(attributes[attribute]) for attribute in self._numbers}
-        texts = {attribute: attributes[attribute] for attribute in self._codes}
-        self._times_s.append(self._time_s)
-        for attribute, value in values.items():
-            self._numbers[attribute].append(value)
-        for attribute, text in texts.items():
-            ids = self._ids[attribute]
-            self._codes[attribute].append(ids.setdefault(text, len(ids)))
-
-    def _here(self) -> str:
-        return f"{self._file}, line {self._parser.CurrentLineNumber}"

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import NO_LEADER_GAP_M, STEP_S, VehicleShape
 from tint_sumo.core.errors import InputError
-from tint_sumo.dataset.fcd import EPISODE_PERIOD_S, read_fcd
+from tint_sumo.dataset.fcd import EPISODE_PERIOD_S
+from tint_sumo.dataset.fcd_reader import are_parked, read_fcd
 from tint_sumo.dataset.schema import TRAJECTORIES, read_shard, read_shard_metadata
 from tint_sumo.scenes.sumocfg import read_net
+from tint_sumo.simulation.vtypes import read_sizes, size_of
 
 MAX_STEP_S = 1.0  # a straight line between farther points would be no driving any more
 _POS_DIGIT_M = 0.01  # SUMO's default precision
@@ -59,7 +61,7 @@ def _successor(lane: Any) -> str:
     return ways[0] if len(ways) == 1 else ""
 
 
-def gaps_m(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None = None) -> NDArray[np.float64]:
+def gaps_m(rows: pd.DataFrame, length_m: NDArray[np.float64], lanes: Lanes | None = None) -> NDArray[np.float64]:
     """Return the gap (M,) from each vehicle's front to the back of the next vehicle at that time; NaN if none is seen.
 
     A leader is seen on the vehicle's lane and, if ``lanes`` are given, on those that follow it without a choice and
@@ -67,7 +69,7 @@ def gaps_m(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None = No
 
     Args:
         rows: columns time_s, lane and pos_m as ``tint_sumo.dataset.fcd.read_fcd`` gives them.
-        vehicle_length_m: of all vehicles; floating-car data do not contain it.
+        length_m: of each row's vehicle, (M,).
         lanes: of the network.
 
     Raises:
@@ -76,39 +78,49 @@ def gaps_m(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None = No
     names = rows["lane"].cat.categories if lanes is None else lanes.names
     number = np.arange(len(names)) if lanes is None else lanes.numbers(rows["lane"].cat.categories)
     lane, pos_m = number[rows["lane"].cat.codes], rows["pos_m"].to_numpy()
+    back_m = pos_m - length_m
     when = np.unique(rows["time_s"], return_inverse=True)[1] * len(names)
     lane_then = when + lane
     order = np.lexsort((pos_m, lane_then))
-    queue, queue_m = lane_then[order], pos_m[order]  # each lane at each time, from the rearmost vehicle to the first
+    queue, queue_back_m = (
+        lane_then[order],
+        back_m[order],
+    )  # each lane at each time, from the rearmost vehicle to the first
 
-    distance_m = np.full(len(rows), np.nan)
-    distance_m[order[:-1]] = np.where(queue[1:] == queue[:-1], np.diff(queue_m), np.nan)
+    gap_m = np.full(len(rows), np.nan)
+    gap_m[order[:-1]] = np.where(queue[1:] == queue[:-1], queue_back_m[1:] - pos_m[order[:-1]], np.nan)
     if lanes is None:
-        return distance_m - vehicle_length_m
-    row = np.flatnonzero(np.isnan(distance_m))
+        return gap_m
+    row = np.flatnonzero(np.isnan(gap_m))
     to_end_m, ahead = lanes.length_m[lane[row]] - pos_m[row], lanes.successor[lane[row]]
     while len(row):
-        seen = (ahead >= 0) & (to_end_m < NO_LEADER_GAP_M + vehicle_length_m)
+        seen = (ahead >= 0) & (to_end_m < NO_LEADER_GAP_M + length_m.max())
         row, to_end_m, ahead = row[seen], to_end_m[seen], ahead[seen]
         rearmost = np.searchsorted(queue, when[row] + ahead).clip(max=len(queue) - 1)
         found = queue[rearmost] == when[row] + ahead
-        distance_m[row[found]] = (to_end_m + queue_m[rearmost])[found]
+        gap_m[row[found]] = (to_end_m + queue_back_m[rearmost])[found]
         row, to_end_m, ahead = row[~found], to_end_m[~found], ahead[~found]
         to_end_m, ahead = to_end_m + lanes.length_m[ahead], lanes.successor[ahead]
-    return distance_m - vehicle_length_m
+    return gap_m
 
 
 def read_tracks(
-    source: Path, *, net_file: Path | None = None, vehicle_length_m: float = VehicleShape().length_m
+    source: Path,
+    *,
+    net_file: Path | None = None,
+    vehicle_length_m: float = VehicleShape().length_m,
+    vtypes_file: Path | None = None,
 ) -> pd.DataFrame:
     """Return rows of tracks, sorted by track and time, at steps of 0.1 s.
 
     Data in other steps, up to 1 s, are interpolated linearly. A vehicle that is missing for a step starts a new track.
+    Vehicles that are parked beside their lane are missing: they follow nobody, and nobody follows them.
 
     Args:
         source: floating-car data, a dataset's folder, its ``trajectories/`` or one file of them.
         net_file: network of floating-car data; with it leaders are seen beyond the end of a lane.
-        vehicle_length_m: of the vehicles in floating-car data.
+        vehicle_length_m: of the vehicles in floating-car data, if no file of vTypes says it.
+        vtypes_file: route file, additional file or .sumocfg with the vTypes of floating-car data.
 
     Returns:
         Columns vehicle (category; EPISODE.VEHICLE for a dataset), track (number), time_s (episode e of a dataset starts
@@ -122,11 +134,25 @@ def read_tracks(
         raise InputError(f"vehicle length must be positive, not {vehicle_length_m} m")
     recorded = _trajectories_in(source)
     if recorded is not None:
-        if net_file is not None:
-            raise InputError(f"{source} knows its leaders; leave the network out")
+        if net_file is not None or vtypes_file is not None:
+            raise InputError(f"{source} knows its leaders; leave network and vTypes out")
         return _in_steps(_recorded(recorded), source)
     lanes = None if net_file is None else Lanes.read(net_file)
-    return _in_steps(_driven(read_fcd(source), vehicle_length_m, lanes), source)
+    rows = read_fcd(source)
+    length_m = np.full(len(rows), vehicle_length_m) if vtypes_file is None else _lengths_m(rows, vtypes_file, source)
+    on_road = ~are_parked(rows)
+    if not on_road.any():
+        raise InputError(f"{source} has parked vehicles only; write it again with traffic in it")
+    return _in_steps(_driven(rows[on_road], length_m[on_road], lanes), source)
+
+
+def _lengths_m(rows: pd.DataFrame, vtypes_file: Path, source: Path) -> NDArray[np.float64]:
+    """Return the length of each row's vehicle, (M,), by its vType."""
+    if "vehicle_class" not in rows:
+        raise InputError(f"{source} lacks the vehicles' types; run SUMO without --fcd-output.attributes")
+    sizes, vtypes = read_sizes(vtypes_file), rows["vehicle_class"].cat
+    length_m = np.array([size_of(vtype, sizes, vtypes_file).length_m for vtype in vtypes.categories])
+    return np.asarray(length_m[vtypes.codes])
 
 
 def _trajectories_in(source: Path) -> Path | None:
@@ -156,13 +182,13 @@ def _recorded(source: Path) -> pd.DataFrame:
     )
 
 
-def _driven(rows: pd.DataFrame, vehicle_length_m: float, lanes: Lanes | None) -> pd.DataFrame:
+def _driven(rows: pd.DataFrame, length_m: NDArray[np.float64], lanes: Lanes | None) -> pd.DataFrame:
     """Return columns vehicle, time_s, position_m and gap_m, by vehicle and time.
 
     Speeds are the finer measure of displacements: rounded to 0.01 m/s they give those of 0.1 s to the millimetre, and
     SUMO's displacements are speed times step. Positions on one lane correct them beyond a position's last digit.
     """
-    rows = rows.assign(gap_m=gaps_m(rows, vehicle_length_m, lanes))
+    rows = rows.assign(gap_m=gaps_m(rows, length_m, lanes))
     rows = rows.sort_values(["vehicle", "time_s"], ignore_index=True)
     moved_m = rows["pos_m"].diff().to_numpy()
     along_lane = (rows["lane"].cat.codes.diff() == 0).to_numpy() & (moved_m > -_POS_DIGIT_M)

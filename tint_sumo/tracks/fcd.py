@@ -15,17 +15,16 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import VehicleShape
 from tint_sumo.core.errors import InputError
-from tint_sumo.dataset.fcd import POSES, read_fcd
+from tint_sumo.dataset.fcd_reader import POSES, is_fcd_table, is_geographic, read_fcd
 from tint_sumo.tracks.reading import Head, TrackFormat, recording_name, register
 
-_SLOW = 1e-3  # positions that change so much less than speeds say are degrees
 _UTM_NORTH, _UTM_SOUTH = 32600, 32700  # EPSG codes of zone 0
 _ZONE_DEG = 6.0
 
 
 def _read(file: Path) -> Mapping[str, Any]:
     rows = read_fcd(file, POSES)
-    if _is_geographic(rows):
+    if is_geographic(rows):
         raise InputError(f"{file} has longitudes and latitudes; give the `format` fcd_geo")
     return _columns(file, rows, rows["x"].to_numpy(), rows["y"].to_numpy())
 
@@ -57,14 +56,6 @@ def _columns(file: Path, rows: pd.DataFrame, x_m: NDArray[np.float64], y_m: NDAr
     }
 
 
-def _is_geographic(rows: pd.DataFrame) -> bool:
-    """Whether the positions are degrees: they change by far less than the speeds say."""
-    steps = rows.sort_values(["vehicle", "time_s"]).groupby("vehicle", observed=True)
-    moved = np.hypot(steps["x"].diff(), steps["y"].diff()).sum()
-    driven_m = (steps["speed_mps"].shift() * steps["time_s"].diff()).sum()
-    return bool(moved < _SLOW * driven_m)
-
-
 def _in_metres(
     longitude: NDArray[np.float64], latitude: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -80,7 +71,7 @@ def _in_metres(
 
 
 def _is_fcd(head: Head) -> bool:
-    is_table = "timestep_time" in head.text.partition("\n")[0]
+    is_table = is_fcd_table(head.text.partition("\n")[0])
     return "<fcd-export" in head.text or is_table or head.file.suffix == ".parquet"
 
 

@@ -26,6 +26,7 @@ def infer_traits(
     *,
     net_file: Path | None = None,
     vehicle_length_m: float = VehicleShape().length_m,
+    vtypes_file: Path | None = None,
 ) -> pd.DataFrame:
     """Return latents of all vehicles, a row for each window of 2 to 20 steps of 0.1 s, by vehicle and time.
 
@@ -33,7 +34,8 @@ def infer_traits(
         source: floating-car data, or trajectories of a dataset, as in ``tint_sumo.dataset.tracks.read_tracks``.
         model: name of a shipped model, folder of a training run, or path of a .safetensors file.
         net_file: SUMO network of floating-car data; with it leaders are seen beyond the end of a lane.
-        vehicle_length_m: of the vehicles in floating-car data.
+        vehicle_length_m: of the vehicles in floating-car data, if no file of vTypes says it.
+        vtypes_file: route file, additional file or .sumocfg with the vTypes of floating-car data.
 
     Returns:
         vehicle (id), window (0, 1, ... of the vehicle), start_s, end_s, steps, has_leader (one within 20 m at every
@@ -46,7 +48,7 @@ def infer_traits(
         InputError: unusable data, network, length or model.
     """
     trained, reach = load(model), read_card(model).input_range
-    rows = read_tracks(source, net_file=net_file, vehicle_length_m=vehicle_length_m)
+    rows = read_tracks(source, net_file=net_file, vehicle_length_m=vehicle_length_m, vtypes_file=vtypes_file)
     track = rows["track"].to_numpy()
     gap_m = rows["gap_m"].where(rows["gap_m"] < NO_LEADER_GAP_M, np.inf).to_numpy()
     windows = cut_windows(track, np.zeros_like(track), rows["position_m"].to_numpy(), gap_m)

@@ -47,6 +47,7 @@ AccelMps2 = Annotated[float, Range(0.01, 100.0)]
 GainPerS = Annotated[float, Range(0.001, 1000.0)]
 TimeS = Annotated[float, Range(0.01, 86_400.0)]
 WarmUpS = Annotated[float, Range(0.0, 86_400.0)]
+WarmStarts = Annotated[int, Range(0, 1000)]
 StepS = Annotated[float, Range(0.01, 1.0)]
 Slots = Annotated[int, Range(1, 200)]  # vehicles in an observation
 WindowCount = Annotated[int, Range(1, 100_000_000)]

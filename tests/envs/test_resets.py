@@ -54,7 +54,7 @@ def actions(seed: int) -> Iterator[int]:
 
 @pytest.mark.parametrize("name", [*SCENES, *USER_NETWORKS])
 def test_nothing_of_an_episode_is_left_after_a_reset(name: str, user_network: Make) -> None:
-    scene: Any = name if name in SCENES else user_network(name).scene(warm_up_s=5.0)
+    scene: Any = name if name in SCENES else user_network(name).scene(warm_up_s=5.0, warm_starts=2)
     with closing(SceneEnv(TaskSettings(scene, **TASK))) as env:
         fresh = env.reset(seed=7)
         fresh_state, snapshot = state(env._episodes), env.snapshot()

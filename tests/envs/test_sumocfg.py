@@ -86,7 +86,7 @@ def test_the_traits_are_the_numbers_of_the_vtypes(user_network: Make) -> None:
 
 
 def test_a_vector_has_as_many_workers_as_environments(user_network: Make) -> None:
-    scene = user_network("merge").scene(warm_up_s=5.0)
+    scene = user_network("merge").scene(warm_up_s=5.0, warm_starts=2)
     with pytest.raises(InputError, match="set workers to num_envs"):
         SceneVectorEnv(2, TaskSettings(scene))
     with pytest.raises(InputError, match="set workers to num_envs"):

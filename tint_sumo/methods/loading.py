@@ -24,7 +24,7 @@ from tint_sumo.methods.training import POLICY, TRAITS, digest
 from tint_sumo.policy import GruPolicy, RecurrentPPO, TraitSource
 from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
 from tint_sumo.policy.wrappers import OnStep, policy_venv
-from tint_sumo.scenes import ALL_SCENES, SCENES, AnyScene, find_scene, paper_scene, read_described
+from tint_sumo.scenes import ALL_SCENES, SCENES, AnyScene, SumocfgScene, find_scene, paper_scene, read_described
 from tint_sumo.traits import TraitModel
 
 _PROBES = 16  # observations for which a policy's outputs must be finite
@@ -45,8 +45,12 @@ class Contender:
 
     @property
     def task(self) -> TaskSettings:
-        """Settings of the environments that it is for; ``dataclasses.replace`` makes others of them."""
-        return TaskSettings(self.scene, self.p_conservative)
+        """Settings of the environments that it is for; ``dataclasses.replace`` makes others of them.
+
+        Each case of a SUMO configuration has a warm-up of its own, so that no traffic is that of the training.
+        """
+        scene = replace(self.scene, warm_starts=0) if isinstance(self.scene, SumocfgScene) else self.scene
+        return TaskSettings(scene, self.p_conservative)
 
     def make_venv(self, num_envs: int, task: TaskSettings, *, on_step: OnStep | None = None) -> VecEnv:
         """Return environments with the observations that the policy takes.

@@ -16,6 +16,7 @@ from tint_sumo.config import (
     StepS,
     TimeS,
     VehicleShape,
+    WarmStarts,
     WarmUpS,
 )
 from tint_sumo.core.errors import InputError
@@ -128,6 +129,8 @@ class SumocfgSettings:
     """Farthest distance at which they are observed."""
     warm_up_s: WarmUpS = SumocfgScene.warm_up_s
     """Time for which the traffic runs before the ego appears."""
+    warm_starts: WarmStarts = SumocfgScene.warm_starts
+    """The traffic of so many seeds is warmed up once each for all episodes; 0: each has a warm-up of its own."""
     time_limit_s: TimeS = SumocfgScene.time_limit_s
     """Longest time of an episode."""
     vehicle: VehicleShape = field(default_factory=VehicleShape)

@@ -20,7 +20,7 @@ import shapely
 import sumolib
 from sumolib.miscutils import parseTime
 
-from tint_sumo.config import MOST_LABELS, DistanceM, EgoController, Slots, TimeS, VehicleShape, WarmUpS
+from tint_sumo.config import MOST_LABELS, DistanceM, EgoController, Slots, TimeS, VehicleShape, WarmStarts, WarmUpS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import require_ranges
 from tint_sumo.core.reading import TABLE_BYTES, require_file
@@ -90,6 +90,7 @@ class SumocfgScene:
     max_vehicles: Slots = 12
     sight_m: DistanceM = 50.0
     warm_up_s: WarmUpS = 30.0  # the traffic runs for so long before the ego appears
+    warm_starts: WarmStarts = 0  # so many states of the traffic are warmed up for all episodes; 0: each has its own
     time_limit_s: TimeS = 50.0
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     controller: EgoController = field(default_factory=EgoController)
@@ -154,6 +155,7 @@ def from_sumocfg(
     max_vehicles: int = SumocfgScene.max_vehicles,
     sight_m: float = SumocfgScene.sight_m,
     warm_up_s: float = SumocfgScene.warm_up_s,
+    warm_starts: int = SumocfgScene.warm_starts,
     time_limit_s: float = SumocfgScene.time_limit_s,
     vehicle: VehicleShape | None = None,
     controller: EgoController | None = None,
@@ -168,6 +170,8 @@ def from_sumocfg(
         max_vehicles: most vehicles in an observation, the nearest ones.
         sight_m: farthest distance at which they are observed.
         warm_up_s: time for which the traffic runs before the ego appears.
+        warm_starts: the traffic of so many seeds is warmed up once each, and an episode begins with one of them, which
+            its seed chooses; it then goes on with random numbers of its own. 0: each episode has a warm-up of its own.
         time_limit_s: of an episode.
         vehicle: the ego's shape.
         controller: of the ego; its desired speeds are the actions.
@@ -198,6 +202,7 @@ def from_sumocfg(
         max_vehicles=max_vehicles,
         sight_m=sight_m,
         warm_up_s=warm_up_s,
+        warm_starts=warm_starts,
         time_limit_s=time_limit_s,
         vehicle=vehicle or VehicleShape(),
         controller=controller or EgoController(),

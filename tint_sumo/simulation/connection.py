@@ -26,16 +26,18 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.network import sumo_program
 
 _CONNECT_TRIES, _CONNECT_WAIT_S = 600, 0.05  # sumo takes a moment to listen
+LOAD_STATE = "--load-state"
 _SIMULATION_OPTIONS = ("--net-file", "--configuration-file", "--seed")  # in which simulations differ
 
 
 @dataclass(frozen=True)
 class Connection:
-    """A running simulation. ``vehicle``, ``vehicletype``, ``route`` and ``simulation`` are SUMO's TraCI domains."""
+    """A running simulation. ``vehicle`` to ``simulation`` are SUMO's TraCI domains."""
 
     backend: Literal["libsumo", "traci"]
     vehicle: Any
     vehicletype: Any
+    person: Any
     route: Any
     simulation: Any
     lane_position_m: Callable[[str], float]  # vehicle.getLanePosition, which is called more often than all else
@@ -97,6 +99,7 @@ def _libsumo(options: Sequence[str]) -> Connection:
                 "libsumo",
                 libsumo.vehicle,
                 libsumo.vehicletype,
+                libsumo.person,
                 libsumo.route,
                 libsumo.simulation,
                 lane_position_m,
@@ -145,11 +148,12 @@ def _traci(options: Sequence[str]) -> Connection:
                 "traci",
                 connection.vehicle,
                 connection.vehicletype,
+                connection.person,
                 connection.route,
                 connection.simulation,
                 connection.vehicle.getLanePosition,
                 connection.simulationStep,
-                connection.load,
+                _loads(connection.load),
                 partial(_end, connection, process, os.getpid()),
             )
         )
@@ -157,6 +161,21 @@ def _traci(options: Sequence[str]) -> Connection:
         process.kill()
         process.wait()
         raise
+
+
+def _loads(load: Callable[[list[str]], Any]) -> Callable[[list[str]], None]:
+    """Return traci's ``load``, mended: after one with a state, SUMO 1.28 loads that state again where none is named."""
+    had_state = False
+
+    def load_once(options: list[str]) -> None:
+        nonlocal had_state
+        has_state = LOAD_STATE in options
+        if had_state and not has_state:
+            load(options)
+        load(options)
+        had_state = has_state
+
+    return load_once
 
 
 def _reach(port: int, process: "subprocess.Popen[bytes]") -> Any:

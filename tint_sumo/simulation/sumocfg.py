@@ -1,6 +1,6 @@
 """The simulation of a SUMO configuration: one episode at a time, with the traffic that the configuration makes.
 
-Each episode loads the configuration anew with a seed of its own, so that it depends on that seed alone. The vehicles
+Each episode loads the network anew with a seed of its own, so that it depends on that seed alone. The vehicles
 around the ego are asked for with a context subscription, at the same cost however large the network is.
 """
 
@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import libsumo
@@ -24,6 +25,7 @@ from tint_sumo.scenes.sumocfg import DEFAULT_VTYPE, SumocfgScene, SumoConfig, ne
 from tint_sumo.simulation.connection import Connection, connect
 from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.simulation.sumo import NO_COLLISION_CHECK, SPEED_MODE_OBEY_SETSPEED
+from tint_sumo.simulation.warm_starts import WarmStarts
 
 EGO = "tint_sumo.ego"  # vehicle, vType and route; no user's id
 _ONLY_STRATEGIC_CHANGES = 513  # lane changes: those that the route asks for, where there is room
@@ -135,6 +137,7 @@ class SumocfgSimulation(Simulation):
         self.passed_m = np.array([np.inf])  # no vehicle's way is ever left behind
         with refusals(scene.config):
             self.connection = connect(sumo_options(scene.config, seed=0), backend)
+        self.warm_starts = WarmStarts(scene, self.connection, partial(sumo_options, scene.config))
         self._kinds = Kinds(scene.config, scene.vtypes, self.connection)
         self._drives = False
         self.slot: dict[str, int] = {}
@@ -148,6 +151,10 @@ class SumocfgSimulation(Simulation):
         ego, (across_m, up_m) = self.egos.box[replica], _AROUND_M
         return View(-across_m, -up_m, across_m, up_m).moved(float(ego["x_m"]), float(ego["y_m"]))
 
+    def close(self) -> None:
+        super().close()
+        self.warm_starts.close()
+
     # Episodes
 
     def reset(self, replica: int, seed: int) -> None:
@@ -158,9 +165,8 @@ class SumocfgSimulation(Simulation):
         """
         self.clear(replica)
         with refusals(self.scene.config):
-            self.connection.load(sumo_options(self.scene.config, seed))
+            self.warm_starts.begin(seed)
             self._define_ego()
-            self.connection.step(self.connection.simulation.getTime() + self.scene.warm_up_s)
             self._let_ego_enter()
             self.connection.vehicle.subscribeContext(EGO, constants.CMD_GET_VEHICLE_VARIABLE, self.scene.sight_m, _SEEN)
             sight = self.connection.vehicle.getContextSubscriptionResults(EGO)[EGO]

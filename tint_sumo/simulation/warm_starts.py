@@ -1,0 +1,124 @@
+"""The traffic of a SUMO configuration before the ego appears: warmed up anew, or loaded as it was saved.
+
+A warm-up can take seconds. So a scene may have a number of warm starts: the traffic of so many seeds is warmed up and
+saved once each, and an episode begins with the one that its seed chooses, and goes on with random numbers of its own.
+
+SUMO loads a saved state into a network that it loads anew, too. It could load one into the simulation that runs, which
+takes less time. But what comes then depends on what ran before, even with the states of its random numbers saved, and
+with persons, parking areas and calibrators SUMO 1.28 can end with a segmentation fault.
+"""
+
+import math
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import libsumo
+import numpy as np
+from traci.exceptions import FatalTraCIError, TraCIException
+
+from tint_sumo.core.errors import InputError
+from tint_sumo.scenes.sumocfg import SumocfgScene
+from tint_sumo.simulation.connection import LOAD_STATE, Connection
+
+_CHOICE, _STATE = 2, 3  # what is drawn from a seed: the number of a state; and from the number of a state: its traffic
+_SAME_M = 0.01  # vehicles and persons of a loaded state are at most so far from where they were
+_SAVING = (
+    *("--save-state.rng", "false"),  # whoever loads it has other random numbers
+    *("--save-state.transportables", "true"),
+    *("--save-state.constraints", "true"),  # of rail signals
+    *("--save-state.precision", "16"),
+)
+_LOADING = ("--load-state.offset", "0", "--load-state.remove-vehicles", "")  # the user's are for a state of the user's
+
+Options = Callable[[int | Sequence[int]], list[str]]  # returns command-line options of a simulation with a seed
+_Positions = dict[tuple[str, str], tuple[float, ...]]  # of all vehicles and persons, m
+
+
+@dataclass(frozen=True)
+class WarmStarts:
+    """Begins the traffic of episodes in a running simulation.
+
+    States lie in a temporary folder, at most as many as the scene has warm starts. They follow from the scene and their
+    number alone, so that it does not matter which process has made them, and for which episode.
+    """
+
+    scene: SumocfgScene
+    connection: Connection
+    options: Options
+    states: dict[int, Path | None] = field(
+        default_factory=dict
+    )  # by number; None where a loaded state is not the saved
+    _folder: list[tempfile.TemporaryDirectory[str]] = field(default_factory=list)  # at most one
+
+    def begin(self, seed: int) -> None:
+        """Load the simulation of an episode, up to the time at which the ego appears.
+
+        Raises:
+            InputError: SUMO does not load a state.
+        """
+        state = self._state_of(seed) if self.scene.warm_starts else None
+        if state is None:
+            self._warm_up(self.options(seed))
+        else:
+            self._load_state(self.options(seed), state)
+
+    def close(self) -> None:
+        """Remove all states; safe to call twice."""
+        while self._folder:
+            self._folder.pop().cleanup()
+
+    def _state_of(self, seed: int) -> Path | None:
+        """Return the state that an episode begins with; None if its traffic is to be warmed up anew."""
+        draw = np.random.SeedSequence([seed, _CHOICE]).generate_state(1)
+        number = int(draw[0]) % self.scene.warm_starts
+        if number not in self.states:
+            self.states[number] = self._save(number)
+        return self.states[number]
+
+    def _save(self, number: int) -> Path | None:
+        """Save a state; return its file, or None if SUMO does not load what it has saved."""
+        if not self._folder:
+            self._folder.append(tempfile.TemporaryDirectory(prefix="tint_sumo."))
+        file = Path(self._folder[0].name) / f"{number}.xml"
+        options = self.options([number, _STATE])
+        self._warm_up([*options, *_SAVING])
+        self.connection.simulation.saveState(str(file))
+        saved = self._positions()
+        self._load_state(options, file)
+        return file if _are_same(saved, self._positions()) else None
+
+    def _warm_up(self, options: list[str]) -> None:
+        self.connection.load(options)
+        self.connection.step(self.connection.simulation.getTime() + self.scene.warm_up_s)
+
+    def _load_state(self, options: list[str], file: Path) -> None:
+        with _refusals(self.scene):
+            self.connection.load([*options, LOAD_STATE, str(file), *_LOADING])
+
+    def _positions(self) -> _Positions:
+        return {
+            (kind, name): domain.getPosition(name)
+            for kind, domain in (("vehicle", self.connection.vehicle), ("person", self.connection.person))
+            for name in domain.getIDList()
+        }
+
+
+def _are_same(saved: _Positions, loaded: _Positions) -> bool:
+    return saved.keys() == loaded.keys() and all(
+        math.dist(position_m, loaded[name]) < _SAME_M for name, position_m in saved.items()
+    )
+
+
+@contextmanager
+def _refusals(scene: SumocfgScene) -> Iterator[None]:
+    try:
+        yield
+    except (libsumo.TraCIException, TraCIException, FatalTraCIError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"SUMO does not load a state of {scene.config.file} that it has saved itself ({reason}); "
+            "set warm_starts to 0"
+        ) from None

@@ -12,7 +12,7 @@ from numbers import Real
 from typing import Annotated, Any, Literal, Self
 
 from tint_sumo.core.errors import InputError, shown
-from tint_sumo.core.ranges import Length, Range, require_ranges
+from tint_sumo.core.ranges import Length, Range, require_ranges, set_floats
 from tint_sumo.core.structures import FileForm, Many
 
 NO_LEADER_GAP_M = 20.0  # stands for the gap of every driver without a leader, whatever its trait, and caps all gaps
@@ -41,7 +41,8 @@ Seed = Annotated[int, SEEDS]  # of a training
 TrafficSeed = Annotated[int, Range(0, 2**32 - 1)]
 SpeedMps = Annotated[float, Range(0.0, 60.0)]
 DistanceM = Annotated[float, Range(0.0, 1000.0)]
-NoiseM = Annotated[float, Range(0.0, 1000.0)]
+NOISES = Range(0.0, 1000.0)
+NoiseM = Annotated[float, NOISES]
 TauS = Annotated[float, Range(0.01, 20.0)]  # with less, drivers cannot keep it; with more, nobody moves
 AccelMps2 = Annotated[float, Range(0.01, 100.0)]
 GainPerS = Annotated[float, Range(0.001, 1000.0)]
@@ -259,6 +260,63 @@ class EgoController:
             raise InputError(
                 f"desired_speeds_mps must rise from the slowest, which waits, to the fastest, not {speeds}"
             )
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """How the ego perceives the other vehicles; the default is a perfect sensor, which sees all of them as they are.
+
+    A vehicle is seen if its centre is within the range and the field of view, if nothing hides it, and while the sensor
+    has not lost it. The eye is above the ego's centre. ``occlusion``: a vehicle is hidden where buildings or boxes of
+    other vehicles cut the straight lines from the eye to its centre and to its four corners, all five of them.
+    A vehicle that is seen again has a new track number.
+    """
+
+    noise_m: NoiseM = 0.0
+    """Standard deviation of the noise on the x and y of each vehicle."""
+    noise_time_s: Annotated[float, Range(0.0, 3600.0)] = 0.0
+    """Time constant in which this noise changes; 0: it is independent from step to step."""
+    dropouts_per_s: Annotated[float, Range(0.0, 100.0)] = 0.0
+    """Rate at which the sensor loses a vehicle that it has."""
+    dropout_s: TimeS = 0.5
+    """Mean time for which a vehicle is lost, exponentially distributed."""
+    range_m: DistanceM | None = None
+    """Distance from centre to centre up to which vehicles are seen; null: unlimited."""
+    field_of_view_deg: Annotated[float, Range(1.0, 360.0)] = 360.0
+    """Angle in which vehicles are seen, half of it to each side of the ego's heading."""
+    occlusion: bool = False
+    """Whether other vehicles and buildings hide vehicles."""
+    corners_m: DistanceM | None = None
+    """Buildings are at all corners of the roads, so far from them, beside those of the scene; null: there are none."""
+    delay_s: Annotated[float, Range(0.0, 1.0)] = 0.0
+    """Vehicles are seen where they were so long ago, a multiple of the simulation's step."""
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+        if not isinstance(self.occlusion, bool):
+            raise InputError(f"occlusion must be True or False, not {shown(self.occlusion)}")
+        set_floats(self, "noise_m", "noise_time_s", "dropouts_per_s", "dropout_s", "range_m")
+        set_floats(self, "field_of_view_deg", "corners_m", "delay_s")
+
+    @property
+    def hides(self) -> bool:
+        """Whether there can be vehicles that it does not see."""
+        is_limited = self.range_m is not None or self.field_of_view_deg < 360.0
+        return is_limited or self.occlusion or self.dropouts_per_s > 0.0
+
+
+PERFECT = Sensor()
+SENSORS = {
+    "perfect": PERFECT,
+    "noisy_0.1": Sensor(noise_m=0.1),
+    "noisy_0.2": Sensor(noise_m=0.2),
+    "correlated": Sensor(noise_m=0.2, noise_time_s=1.0),
+    "dropouts": Sensor(dropouts_per_s=0.5, dropout_s=0.5),
+    "range_15": Sensor(range_m=15.0),
+    "occlusion": Sensor(occlusion=True),
+    "corners": Sensor(occlusion=True, corners_m=1.5),
+    "delay_0.2": Sensor(delay_s=0.2),
+}
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.scenes import T_INTERSECTION
 
-TASK: dict[str, Any] = {"position_noise_m": 0.1, "tracks": True, "time_limit_s": 6.0, "p_conservative": (0.2, 0.8)}
+TASK: dict[str, Any] = {"sensor": "noisy_0.1", "tracks": True, "time_limit_s": 6.0, "p_conservative": (0.2, 0.8)}
 Copy = Callable[[Any], Any]
 COPIES: dict[str, Copy] = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 copies = pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
@@ -51,7 +51,7 @@ def test_a_copy_goes_on_like_the_original_which_does_not_notice(
     """As planners use it: with the registered arguments, of the wrapped and of the bare environment."""
     task: dict[str, Any] = TASK
     if scene == "merge":
-        task = {"position_noise_m": 0.1, "time_limit_s": 6.0, "scene": user_network("merge").scene(warm_up_s=5.0)}
+        task = {"sensor": "noisy_0.1", "time_limit_s": 6.0, "scene": user_network("merge").scene(warm_up_s=5.0)}
     with closing(gymnasium.make(ENV_IDS.get(scene, SCENE_ENV_ID), backend="libsumo", **task)) as env:
         env.reset(seed=3)
         for _ in range(20):

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from tests.simulation.scenes import LOWER
 from tint_sumo import ENV_IDS
-from tint_sumo.config import REWARD_PRESETS
+from tint_sumo.config import REWARD_PRESETS, SENSORS, Sensor
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.rows import TRACKS
@@ -104,7 +104,7 @@ def test_one_seed_gives_one_history(env: SceneEnv) -> None:
 
 @pytest.mark.parametrize("num_envs", [3, 10])
 def test_each_environment_of_a_batch_lives_like_a_single_one(num_envs: int) -> None:
-    settings: dict[str, Any] = {"time_limit_s": 8.0, "position_noise_m": 0.1, "tracks": True}
+    settings: dict[str, Any] = {"time_limit_s": 8.0, "sensor": "noisy_0.1", "tracks": True}
     vector = SceneVectorEnv(num_envs, TaskSettings(**settings), autoreset_mode="SameStep")
     single = SceneEnv(TaskSettings(**settings))
     try:
@@ -177,7 +177,7 @@ def test_infos_contain_positions_on_routes_with_tracks(env: SceneEnv) -> None:
 def test_position_noise_has_its_standard_deviation_and_spares_the_ego() -> None:
     clear, noisy = (
         SceneEnv(TaskSettings(tracks=True)),
-        SceneEnv(TaskSettings(tracks=True, position_noise_m=0.2, backend="traci")),
+        SceneEnv(TaskSettings(tracks=True, sensor=SENSORS["noisy_0.2"], backend="traci")),
     )
     try:
         clear.reset(seed=1)
@@ -308,8 +308,9 @@ def test_rendering_shows_every_vehicle() -> None:
         ({"reward": "mine"}, "unknown reward preset 'mine'; choose one of paper, authors"),
         ({"time_limit_s": 0.01}, "time_limit_s must be at least a step"),
         ({"time_limit_s": float("inf")}, "time_limit_s must lie in 0.01 to 86400, not inf"),
-        ({"position_noise_m": -0.1}, "position_noise_m must lie in 0 to 1000, not -0.1"),
-        ({"position_noise_m": float("nan")}, "position_noise_m must lie in 0 to 1000, not nan"),
+        ({"sensor": "blind"}, "unknown sensor 'blind'; choose one of: perfect, noisy_0.1"),
+        ({"sensor": 0.1}, r"sensor must be a Sensor or a name \(perfect, .*\), not 0.1"),
+        ({"sensor": Sensor(delay_s=0.25)}, "delay_s must be a multiple of the step of 0.1 s, not 0.25"),
         ({"decision_s": 0.25}, "decision_s must be a multiple of the step of 0.1 s, not 0.25"),
         ({"decision_s": 0.0}, "decision_s must lie in 0.01 to 86400, not 0.0"),
         ({"decision_s": float("inf")}, "decision_s must lie in 0.01 to 86400, not inf"),
@@ -317,13 +318,32 @@ def test_rendering_shows_every_vehicle() -> None:
         ({"decision_s": True}, "decision_s must lie in 0.01 to 86400, not True"),
         ({"max_episode_steps": 0}, "max_episode_steps must lie in 1 to "),
         ({"max_episode_steps": "3"}, "max_episode_steps must lie in 1 to "),
-        ({"position_noise_m": "little"}, "position_noise_m must lie in 0 to 1000, not 'little'"),
         ({"tracks": "yes"}, "tracks must be True or False, not 'yes'"),
     ],
 )
 def test_bad_arguments(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         SceneEnv(TaskSettings(**arguments))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"position_noise_m": -0.1}, "position_noise_m must lie in 0 to 1000, not -0.1"),
+        ({"position_noise_m": float("nan")}, "position_noise_m must lie in 0 to 1000, not nan"),
+        ({"position_noise_m": "little"}, "position_noise_m must lie in 0 to 1000, not 'little'"),
+        ({"position_noise_m": 0.1, "sensor": "range_15"}, "position_noise_m is noise_m of the sensor; leave it out"),
+    ],
+)
+def test_bad_noise_of_gymnasium_s_shorthand(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        gymnasium.make(ENV_IDS[T_INTERSECTION], **arguments)
+
+
+def test_gymnasium_s_shorthand_for_noise_is_a_sensor() -> None:
+    env = gymnasium.make(ENV_IDS[T_INTERSECTION], position_noise_m=0.2)
+    assert env.unwrapped._settings == TaskSettings(sensor=Sensor(noise_m=0.2))  # type: ignore[attr-defined]
+    env.close()
 
 
 def test_bad_render_modes() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from tint_sumo.config import Mix, Population, Traffic
+from tint_sumo.config import SENSORS, Mix, Population, Traffic
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs.episodes import (
     Episodes,
@@ -79,8 +79,6 @@ def test_a_decision_holds_for_whole_steps(settings: dict[str, Any], steps: int, 
     [
         {"time_limit_s": 0.09},
         {"time_limit_s": float("inf")},
-        {"position_noise_m": float("inf")},
-        {"position_noise_m": -1e-9},
         {"decision_s": 0.05},
         {"decision_s": 0.0},
         {"decision_s": -0.1},
@@ -91,7 +89,7 @@ def test_a_decision_holds_for_whole_steps(settings: dict[str, Any], steps: int, 
     ],
 )
 def test_values_without_sense_are_refused(settings: dict[str, Any]) -> None:
-    assert TaskSettings(time_limit_s=0.1, position_noise_m=0.0)
+    assert TaskSettings(time_limit_s=0.1)
     with pytest.raises(InputError, match=next(iter(settings)).replace("reward", "unknown reward")):
         TaskSettings(**settings)
 
@@ -128,14 +126,14 @@ def played(index: int, num_envs: int, rng: np.random.Generator, **settings: Any)
 
 
 def test_an_episode_and_its_noise_follow_from_the_generator_alone() -> None:
-    task: dict[str, Any] = {"position_noise_m": 0.1, "time_limit_s": 0.5, "tracks": True}
+    task: dict[str, Any] = {"sensor": "noisy_0.1", "time_limit_s": 0.5, "tracks": True}
     alone = played(0, 1, np.random.default_rng(5), **task)
     assert repr(alone) == repr(played(1, 3, np.random.default_rng(5), **task))
     assert repr(alone) != repr(played(1, 3, np.random.default_rng(6), **task))
 
 
 def test_noise_is_drawn_anew_in_every_step_and_episode() -> None:
-    with episodes(1, position_noise_m=0.1) as noisy, episodes(1, backend="traci") as clear:
+    with episodes(1, sensor=SENSORS["noisy_0.1"]) as noisy, episodes(1, backend="traci") as clear:
         drawn = []
         for seed in (1, 2):
             for batch in (noisy, clear):
@@ -147,7 +145,7 @@ def test_noise_is_drawn_anew_in_every_step_and_episode() -> None:
                 assert len(np.unique(shown, axis=0)) == len(shown) > 1, "each vehicle has noise of its own"
                 for batch in (noisy, clear):
                     batch.step(np.array([STOP]))
-        assert clear._noise == {} and not clear._noise_m.any()
+        assert not clear.sensing.noise_m.any()
     assert len(np.unique(np.round(drawn, 6), axis=0)) == 6
     assert np.abs(drawn).max() < 0.6 / 20.0
 

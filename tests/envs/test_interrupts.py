@@ -13,7 +13,7 @@ from tests.envs.test_resets import assert_same_answers
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
 
-TASK: dict[str, Any] = {"position_noise_m": 0.1, "tracks": True, "time_limit_s": 0.8}
+TASK: dict[str, Any] = {"sensor": "noisy_0.1", "tracks": True, "time_limit_s": 0.8}
 Make = Callable[[], Any]
 KINDS: dict[str, tuple[Make, int]] = {
     "single": (lambda: SceneEnv(TaskSettings(**TASK)), 200),

@@ -14,14 +14,14 @@ from tint_sumo.envs.episodes import Episodes
 from tint_sumo.scenes import SCENES
 
 GO, STOP = 2, 0
-TASK: dict[str, Any] = {"tracks": True, "position_noise_m": 0.1, "time_limit_s": 30.0}
+TASK: dict[str, Any] = {"tracks": True, "sensor": "noisy_0.1", "time_limit_s": 30.0}
 Make = Callable[[str], UserNetwork]
 
 
 def state(episodes: Episodes) -> dict[str, Any]:
     """Every array and list that has an entry per environment, and the generators of the noise."""
     simulation = episodes.simulation
-    parts = [simulation, simulation.slots, simulation.egos]
+    parts = [simulation, simulation.slots, simulation.egos, episodes.sensing]
     parts += [getattr(simulation, name) for name in ("yielding", "_demand") if hasattr(simulation, name)]
     found = {
         f"{type(part).__name__}.{name}": value.tolist() if isinstance(value, np.ndarray) else list(value)
@@ -30,8 +30,11 @@ def state(episodes: Episodes) -> dict[str, Any]:
         if isinstance(value, np.ndarray | list) and len(value) == simulation.replicas and name != "_newcomer"
     }
     found.pop("Demand._streams", None)  # objects, which are new in every episode
-    noise = {index: rng.bit_generator.state for index, rng in episodes._noise.items()}
-    return {**found, "noise": noise, "rows": episodes.rows.tolist(), "steps": episodes.steps.tolist()}
+    sensing = episodes.sensing
+    assert sensing._normals is not None
+    noise = [rng and rng.bit_generator.state for rng in sensing._normals._generators]
+    drawn = (sensing._normals._ahead.tolist(), sensing._normals._next.tolist())
+    return {**found, "noise": noise, "drawn": drawn, "rows": episodes.rows.tolist(), "steps": episodes.steps.tolist()}
 
 
 def assert_same_state(first: dict[str, Any], second: dict[str, Any]) -> None:

@@ -23,6 +23,7 @@ from tint_sumo.envs.rows import (
     observe_tracks,
     outcome_name,
     outcome_names,
+    reveal,
     row_type,
     start_info,
     step_info,
@@ -113,13 +114,35 @@ def test_observations_are_scaled_and_bounded() -> None:
     noise_m = np.zeros((2, 3, 2))
     noise_m[0, 0], noise_m[0, 2] = (1.0, -2.0), (5.0, 5.0)
     steps = np.array([7, 30])
-    observe(egos, np.array([1.5, 30.0]), present, vehicles, traits, noise_m, steps, Scales(20.0, 3.0, 0.1), rows)
+    source = np.where(present, np.arange(3), -1)
+    track = np.array([[4, 7, -1], [-1, -1, 2]])
+    scales = Scales(20.0, 3.0, 0.1)
+    observe(egos, np.array([1.5, 30.0]), source, vehicles, traits, track, noise_m, steps, scales, rows)
     np.testing.assert_allclose(rows["ego"], [[0.1, -0.2, 0.3, 0.4], [2.0, -2.0, 0.0, -2.0]], atol=1e-7)
     np.testing.assert_allclose(rows["vehicles"][0], [[0.55, -0.6], [2.0, -2.0], [0.0, 0.0]], atol=1e-7)
     np.testing.assert_allclose(rows["vehicles"][1], [[0.0, 0.0], [0.0, 0.0], [-2.0, 2.0]], atol=1e-7)
     np.testing.assert_array_equal(rows["mask"], present.astype(float))
     np.testing.assert_array_equal(rows["traits"], traits)
+    np.testing.assert_array_equal(rows["track"], track)
     np.testing.assert_allclose(rows["time_s"], [0.7, 3.0])
+
+
+def test_slots_of_the_observation_show_the_vehicles_that_they_are_given() -> None:
+    rows = np.zeros(1, row_type(3))
+    egos, vehicles = (
+        boxes((0.0, 0.0, 1.0, 0.0)),
+        boxes((2.0, 0.0, 1.0, 0.0), (4.0, 0.0, 1.0, 0.0), (6.0, 0.0, 1.0, 0.0)),
+    )
+    noise_m = np.array([[[0.0, 0.0], [0.0, 1.0], [0.5, 0.0]]])
+    traits, source = np.array([[0, 1, 0]], np.int8), np.array([[2, -1, 1]])
+    scales = Scales(20.0, 3.0, 0.1)
+    track, steps = np.array([[5, -1, 3]]), np.array([1])
+    observe(egos, np.zeros(1), source, vehicles[None], traits, track, noise_m, steps, scales, rows)
+    np.testing.assert_allclose(rows["vehicles"][0] * 20.0, [[6.5, 0.0], [0.0, 0.0], [4.0, 1.0]], atol=1e-6)
+    assert (rows["mask"].tolist(), rows["traits"].tolist()) == ([[1.0, 0.0, 1.0]], [[0, -1, 1]])
+    reveal(egos, np.array([[True, True, False]]), vehicles[None], np.array([[0, 1, -1]], np.int8), scales, rows)
+    np.testing.assert_allclose(rows["true_vehicles"][0] * 20.0, [[2.0, 0.0], [4.0, 0.0], [0.0, 0.0]], atol=1e-6)
+    assert (rows["true_mask"].tolist(), rows["true_traits"].tolist()) == ([[1, 1, 0]], [[0, 1, -1]])
 
 
 def test_tracks_are_seen_with_the_noise_along_the_way() -> None:
@@ -132,13 +155,19 @@ def test_tracks_are_seen_with_the_noise_along_the_way() -> None:
     front_m, gap_m = np.array([[10.0, 20.0, 30.0, 40.0]]), np.array([[3.0, 4.0, 0.0, 0.0]])
     leader = np.array([[1, 0, -1, -1]])
     route, passed_m = np.array([[0, 1, 1, 0]]), np.array([5.0, 6.0])
-    observe_tracks(np.array([6.0]), passed_m, present, route, vehicles, front_m, leader, gap_m, noise_m, rows)
+    source = np.where(present, np.arange(4), -1)
+    observe_tracks(np.array([6.0]), passed_m, source, route, vehicles, front_m, leader, gap_m, noise_m, rows)
     # Along their ways the noise is -0.5, 2.2, 0.25 and 5.6 m.
     np.testing.assert_allclose(rows["position_m"], [[9.5, 22.2, 30.25, 0.0]])
     np.testing.assert_allclose(rows["gap_m"], [[3.0 + 0.5 + 2.2, 4.0 - 2.2 - 0.5, np.inf, np.inf]])
     np.testing.assert_array_equal(rows["passed"], [[1, 0, 0, 0]])
-    observe_tracks(np.array([4.0]), passed_m, present, route, vehicles, front_m, leader, gap_m, noise_m, rows)
+    observe_tracks(np.array([4.0]), passed_m, source, route, vehicles, front_m, leader, gap_m, noise_m, rows)
     assert not rows["passed"].any()
+    source = np.array([[-1, 2, 0, -1]])
+    observe_tracks(np.array([6.0]), passed_m, source, route, vehicles, front_m, leader, gap_m, noise_m, rows)
+    np.testing.assert_allclose(rows["position_m"], [[0.0, 30.25, 9.5, 0.0]])
+    np.testing.assert_allclose(rows["gap_m"], [[np.inf, np.inf, 5.7, np.inf]])
+    np.testing.assert_array_equal(rows["passed"], [[0, 0, 1, 0]])
 
 
 def test_a_decision_s_rewards_are_summed_up_and_its_end_is_kept() -> None:

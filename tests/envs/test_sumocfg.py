@@ -14,6 +14,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from tests.envs.test_workers import assert_infos_equal
 from tests.scenes.networks import USER_NETWORKS, UserNetwork
 from tint_sumo import SCENE_ENV_ID
+from tint_sumo.config import SENSORS
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
@@ -129,7 +130,7 @@ def test_the_mix_of_a_configuration_cannot_be_changed(settings: dict[str, float]
 @pytest.mark.parametrize("name", [*USER_NETWORKS, T_INTERSECTION])
 def test_an_episode_goes_on_from_a_snapshot_as_it_did(name: str, user_network: Make) -> None:
     scene: Any = name if name == T_INTERSECTION else user_network(name).scene(warm_up_s=5.0)
-    with made(scene, position_noise_m=0.1, tracks=True, time_limit_s=500.0) as env:
+    with made(scene, sensor=SENSORS["noisy_0.1"], tracks=True, time_limit_s=500.0) as env:
         env.reset(seed=1)
         play(env, 0, 10)
         here = env.step(1)
@@ -142,7 +143,7 @@ def test_an_episode_goes_on_from_a_snapshot_as_it_did(name: str, user_network: M
         assert returned((observation, info))[:3] == returned(here)[:3]
         assert play(env, 1) == went_on
         assert env.np_random.integers(1000) == drawn
-        with made(scene, position_noise_m=0.1, tracks=True, time_limit_s=500.0, backend="traci") as other:
+        with made(scene, sensor=SENSORS["noisy_0.1"], tracks=True, time_limit_s=500.0, backend="traci") as other:
             other.restore(snapshot)
             assert play(other, 1) == went_on
 
@@ -153,7 +154,7 @@ def test_the_episodes_of_a_vector_go_on_from_a_snapshot_as_they_did(kind: str, u
         "own network": [user_network("merge").scene(warm_up_s=5.0)] * 2,
         "scenes": ["roundabout", T_INTERSECTION],
     }.get(kind, [T_INTERSECTION])
-    tasks = [TaskSettings(scene, position_noise_m=0.1, tracks=True, time_limit_s=12.0) for scene in scenes]
+    tasks = [TaskSettings(scene, sensor=SENSORS["noisy_0.1"], tracks=True, time_limit_s=12.0) for scene in scenes]
     further: dict[str, Any] = {"workers": 2, "autoreset_mode": "SameStep"} if kind == "workers" else {}
     settings = tasks[0] if kind == "workers" else tasks
     actions = np.random.default_rng(0).integers(3, size=(300, 4))
@@ -195,7 +196,7 @@ OTHERS: tuple[dict[str, Any], ...] = (
     {"p_conservative": 0.5},
     {"time_limit_s": 20.0},
     {"tau_s": 1.5},
-    {"position_noise_m": 0.1},
+    {"sensor": "noisy_0.1"},
     {"decision_s": 0.2},
 )
 

@@ -26,7 +26,7 @@ TASK: dict[str, Any] = {
     "scene": "four_way_turn",
     "p_conservative": 0.5,
     "time_limit_s": 8.0,
-    "position_noise_m": 0.1,
+    "sensor": "noisy_0.1",
     "tracks": True,
 }
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from tests.envs.test_environments import ENV_ID, assert_equal
+from tint_sumo.config import SENSORS
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
@@ -50,7 +51,7 @@ def wait_until_ended(process_ids: list[int]) -> None:
 
 @pytest.mark.parametrize(("workers", "mode"), [(2, "SameStep"), (3, "NextStep")])
 def test_results_do_not_depend_on_the_number_of_workers(workers: int, mode: str) -> None:
-    task = TaskSettings(time_limit_s=6.0, position_noise_m=0.1, p_conservative=0.6, tracks=True)
+    task = TaskSettings(time_limit_s=6.0, sensor=SENSORS["noisy_0.1"], p_conservative=0.6, tracks=True)
     one = SceneVectorEnv(5, task, autoreset_mode=mode)
     many = SceneVectorEnv(5, task, workers=workers, autoreset_mode=mode)
     try:

@@ -9,7 +9,7 @@ import pytest
 
 from tests.bombs import BOMBS, bomb
 from tint_sumo import traits
-from tint_sumo.config import ALL_MIXES, Mix, PpoSettings
+from tint_sumo.config import ALL_MIXES, SENSORS, Mix, PpoSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
 from tint_sumo.methods import loading
@@ -87,7 +87,7 @@ def test_trained_policies_by_folder_and_by_file(run: Path, path: str) -> None:
 def test_a_policy_drives_in_the_world_it_is_asked_to(run_with_traits: Path) -> None:
     contender = load_policy(run_with_traits)
     assert contender.source is not None and isinstance(contender.source(), EncoderTraits)
-    task = TaskSettings(p_conservative=ALL_MIXES, position_noise_m=0.1, tau_s=1.5, time_limit_s=3.0)
+    task = TaskSettings(p_conservative=ALL_MIXES, sensor=SENSORS["noisy_0.1"], tau_s=1.5, time_limit_s=3.0)
     found = evaluate(contender.policy, lambda num_envs: contender.make_venv(num_envs, task), 3, 0)
     assert len(found.cases) == 3
 

@@ -68,7 +68,7 @@ def test_long_steps_do_not_make_the_ego_overshoot(user_network: Make) -> None:
         ({"max_vehicles": 0}, "max_vehicles must lie in 1 to 200"),
         ({"sight_m": float("nan")}, "sight_m must lie in 0 to 1000"),
         ({"warm_up_s": -1.0}, "warm_up_s must lie in"),
-        ({"warm_starts": -1}, "warm_starts must lie in 0 to 1,000"),
+        ({"warm_starts": -1}, "warm_starts must lie in 0 to 1000"),
     ],
 )
 def test_bad_tasks_are_refused(changes: dict[str, object], message: str, merge: UserNetwork) -> None:

@@ -23,7 +23,7 @@ from tint_sumo.cli.values import (
     TestTau,
     optional,
 )
-from tint_sumo.config import Decisions, Mix, NoiseM, Seed
+from tint_sumo.config import Decisions, Mix, NoiseM, Seed, Sensor
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.ranges import Processes
 from tint_sumo.core.stores import name_in, working_folder
@@ -219,7 +219,7 @@ def task_of(
 ) -> "TaskSettings":
     """Return the settings of the environments that flags ask for; what is not given is as in the policy's training."""
     mix = contender.p_conservative if p_conservative is None else Mix.parse(p_conservative)
-    return replace(contender.task, p_conservative=mix, position_noise_m=noise_m, tau_s=tau_s)
+    return replace(contender.task, p_conservative=mix, sensor=Sensor(noise_m=noise_m), tau_s=tau_s)
 
 
 def content_of(task: "TaskSettings") -> dict[str, Any]:
@@ -227,6 +227,6 @@ def content_of(task: "TaskSettings") -> dict[str, Any]:
     return {
         "scene": task.scene.name,
         "p_conservative": plain(task.p_conservative),
-        "position_noise_m": task.position_noise_m,
+        "position_noise_m": task.sensor.noise_m,
         "tau_s": task.played.tau_s,
     }

@@ -12,18 +12,21 @@ from typing import Any
 
 from gymnasium.vector import AutoresetMode
 
+from tint_sumo.config import NOISES, Sensor
+from tint_sumo.core.errors import InputError
 from tint_sumo.core.structures import require_fields
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.scene_env import SceneEnv
 from tint_sumo.envs.vector import SceneVectorEnv
+
+_NOISE = "position_noise_m"  # shorthand for a sensor that has this noise alone
 
 
 class GymnasiumEnv(SceneEnv):
     """``SceneEnv`` as ``gymnasium.make`` makes it."""
 
     def __init__(self, render_mode: str | None = None, **task: Any) -> None:
-        _require_known(GymnasiumEnv, task)
-        super().__init__(TaskSettings(**task), render_mode)
+        super().__init__(TaskSettings(**_known(GymnasiumEnv, task)), render_mode)
 
 
 class GymnasiumVectorEnv(SceneVectorEnv):
@@ -37,7 +40,7 @@ class GymnasiumVectorEnv(SceneVectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **task: Any,
     ) -> None:
-        _require_known(GymnasiumVectorEnv, task)
+        task = _known(GymnasiumVectorEnv, task)
         scenes = task.get("scene")
         if isinstance(scenes, list | tuple):
             each = [TaskSettings(**{**task, "scene": scene}) for scene in scenes]
@@ -46,8 +49,19 @@ class GymnasiumVectorEnv(SceneVectorEnv):
             super().__init__(num_envs, TaskSettings(**task), render_mode, workers, autoreset_mode)
 
 
-def _require_known(entry_point: type, task: Mapping[str, Any]) -> None:
-    """Raise InputError if neither an entry point nor ``TaskSettings`` has an argument of this name."""
+def _known(entry_point: type, task: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of ``TaskSettings`` among those of an entry point; ``position_noise_m`` makes a sensor.
+
+    Raises:
+        InputError: neither an entry point nor ``TaskSettings`` has an argument of some name, or the noise has no sense.
+    """
     arguments = signature(entry_point).parameters.values()
     named = [argument.name for argument in arguments if argument.kind is not argument.VAR_KEYWORD]
-    require_fields(task, dict.fromkeys([*named, *(field.name for field in fields(TaskSettings))]))
+    require_fields(task, dict.fromkeys([*named, *(field.name for field in fields(TaskSettings)), _NOISE]))
+    if _NOISE not in task:
+        return dict(task)
+    if "sensor" in task:
+        raise InputError(f"{_NOISE} is noise_m of the sensor; leave it out where sensor is given")
+    NOISES.require(_NOISE, task[_NOISE])
+    others = {name: value for name, value in task.items() if name != _NOISE}
+    return {**others, "sensor": Sensor(noise_m=task[_NOISE])}

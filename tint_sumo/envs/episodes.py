@@ -11,23 +11,26 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from tint_sumo.config import (
+    PERFECT,
     POSITION_SCALE_M,
     REWARD_PRESETS,
+    SENSORS,
     SPEED_SCALE_MPS,
     Backend,
     Decisions,
     Mix,
-    NoiseM,
+    Sensor,
     TauS,
     TimeS,
 )
-from tint_sumo.core.errors import InputError, shown
+from tint_sumo.core.errors import InputError, find_named, shown
 from tint_sumo.core.ranges import require_ranges
 from tint_sumo.envs.rows import (
     BOUND,
     COLLISION,
     GOING_ON,
     TRACKS,
+    TRUTH,
     Rows,
     Scales,
     TaskRules,
@@ -35,9 +38,12 @@ from tint_sumo.envs.rows import (
     judge,
     observe,
     observe_tracks,
+    reveal,
     row_type,
 )
-from tint_sumo.scenes import AnyScene, find_scene, paper_scene
+from tint_sumo.envs.sensing import Sensing
+from tint_sumo.scenes import AnyScene, find_scene, paper_scene, require_built_in
+from tint_sumo.scenes.buildings import corner_buildings
 from tint_sumo.scenes.geometry import NO_VEHICLE, Floats
 from tint_sumo.simulation import make_simulation
 from tint_sumo.simulation.timing import StepPart, does
@@ -50,8 +56,8 @@ _STEP_TOLERANCE = 1e-6  # of decision_s in steps, for numbers such as 0.3 / 0.1
 class TaskSettings:
     """Settings of an episode; ``tint_sumo.envs.scene_env.SceneEnv`` explains them.
 
-    They are made once, by the user or by a command, and passed on as they are. A built-in scene's name for ``scene``,
-    and one number or two for ``p_conservative``, are taken here, too, and nowhere below.
+    They are made once, by the user or by a command, and passed on as they are. Names of a built-in scene and of a
+    sensor, and one number or two for ``p_conservative``, are taken here, too, and nowhere below.
 
     Raises:
         InputError: a value makes no sense.
@@ -61,7 +67,7 @@ class TaskSettings:
     p_conservative: Mix | None = None
     reward: str = "paper"
     time_limit_s: TimeS | None = None
-    position_noise_m: NoiseM = 0.0
+    sensor: Sensor = PERFECT
     tau_s: TauS | None = None
     tracks: bool = False
     decision_s: TimeS | None = None
@@ -72,19 +78,28 @@ class TaskSettings:
         object.__setattr__(self, "scene", find_scene(self.scene))
         if self.p_conservative is not None:
             object.__setattr__(self, "p_conservative", Mix.parse(self.p_conservative))
+        object.__setattr__(self, "sensor", find_sensor(self.sensor))
         if self.reward not in REWARD_PRESETS:
             raise InputError(f"unknown reward preset {self.reward!r}; choose one of {', '.join(REWARD_PRESETS)}")
         require_ranges(self)
         if not isinstance(self.tracks, bool):
             raise InputError(f"tracks must be True or False, not {shown(self.tracks)}")
-        steps = self._decision_s / self._step_s
-        if not math.isclose(steps, max(round(steps), 1), rel_tol=_STEP_TOLERANCE):
+        if not self._is_multiple(self._decision_s) or self._decision_s < self._step_s / 2:
             raise InputError(f"decision_s must be a multiple of the step of {self._step_s:g} s, not {self.decision_s}")
+        if not self._is_multiple(self.sensor.delay_s):
+            raise InputError(
+                f"delay_s must be a multiple of the step of {self._step_s:g} s, not {self.sensor.delay_s:g}"
+            )
         scene = self.played
         if not scene.step_s <= scene.time_limit_s < math.inf:
             raise InputError(
                 f"time_limit_s must be at least a step of {scene.step_s:g} s, and finite, not {scene.time_limit_s}"
             )
+
+    def _is_multiple(self, time_s: float) -> bool:
+        """Whether a time is so many steps of the simulation."""
+        steps = time_s / self._step_s
+        return math.isclose(steps, round(steps), rel_tol=_STEP_TOLERANCE)
 
     @property
     def _step_s(self) -> float:
@@ -107,13 +122,14 @@ class TaskSettings:
     @cached_property
     def fingerprint(self) -> str:
         """Digest of all settings on which the course of an episode depends; 16 hexadecimal digits."""
-        text = repr((self.played, self.position_noise_m, self.steps_per_decision))
+        text = repr((self.played, self.sensor, self.steps_per_decision))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
     def slot_infos(self) -> tuple[str, ...]:
         """Fields of the infos that have a value for each vehicle slot."""
-        return ("traits", *TRACKS) if self.tracks else ("traits",)
+        truth = () if self.sensor == PERFECT else TRUTH
+        return ("traits", *(TRACKS if self.tracks else ()), *truth)
 
     @cached_property
     def played(self) -> AnyScene:
@@ -122,7 +138,24 @@ class TaskSettings:
         limit_s = scene.time_limit_s if self.time_limit_s is None else self.time_limit_s
         if self.max_episode_steps is not None:
             limit_s = min(limit_s, self.max_episode_steps * self.steps_per_decision * scene.step_s)
+        if self.sensor.corners_m is not None:
+            built_in = require_built_in("corners_m", scene)
+            buildings = built_in.buildings + corner_buildings(built_in, self.sensor.corners_m)
+            scene = replace(built_in, buildings=buildings)
         return replace(scene, time_limit_s=limit_s)
+
+
+def find_sensor(sensor: str | Sensor) -> Sensor:
+    """Return the sensor of this name, or the sensor itself.
+
+    Raises:
+        InputError: there is none of this name, or it is no sensor.
+    """
+    if isinstance(sensor, Sensor):
+        return sensor
+    if not isinstance(sensor, str):
+        raise InputError(f"sensor must be a Sensor or a name ({', '.join(SENSORS)}), not {shown(sensor)}")
+    return find_named("sensor", sensor, SENSORS)
 
 
 def action_space(scene: AnyScene) -> spaces.Discrete:
@@ -164,8 +197,8 @@ class Episodes:
         self._steps_per_decision = settings.steps_per_decision
         self.steps = np.zeros(num_envs, np.int64)  # simulation steps since each episode's start
         self._parked: set[int] = set()
-        self._noise: dict[int, np.random.Generator] = {}  # the generator of each environment, if there is noise
-        self._noise_m: Floats = np.zeros((num_envs, scene.max_vehicles, 2))
+        self._reveals = settings.sensor != PERFECT
+        self.sensing = Sensing(settings.sensor, self.simulation, scene.step_s)
 
     def begin(self, index: int, rng: np.random.Generator) -> None:
         """Start a new episode, whose seed is drawn from an environment's generator."""
@@ -174,8 +207,7 @@ class Episodes:
         self._parked.discard(index)
         self.rows[index] = np.zeros((), self.rows.dtype)
         self.steps[index] = 0
-        if self.settings.position_noise_m > 0.0:
-            self._noise[index] = np.random.default_rng([seed, 1])
+        self.sensing.begin(index, seed)
         self._observe(slice(index, index + 1))
 
     def park(self, index: int) -> None:
@@ -223,38 +255,41 @@ class Episodes:
 
     @does(StepPart.OBSERVATION)
     def _observe(self, envs: slice) -> None:
-        """Write the observations of some environments, each with noise from its own generator."""
-        egos, slots = self.simulation.egos, self.simulation.slots
-        for index in self._noise.keys() & range(envs.start, envs.stop):
-            noise = self._noise[index].normal(0.0, self.settings.position_noise_m, self._noise_m.shape[1:])
-            self._noise_m[index] = noise
+        """Write the observations of some environments, as their sensors have them."""
+        egos, slots, sensing, rows = self.simulation.egos, self.simulation.slots, self.sensing, self.rows[envs]
+        traits = self._trait_of_member[slots.member[envs]]
+        sensing.look(envs)
         observe(
             egos.box[envs],
             egos.speed_mps[envs],
-            slots.present[envs],
+            sensing.source[envs],
             slots.box[envs],
-            self._trait_of_member[slots.member[envs]],
-            self._noise_m[envs],
+            traits,
+            sensing.track[envs],
+            sensing.noise_m[envs],
             self.steps[envs],
             self._scales,
-            self.rows[envs],
+            rows,
         )
         if self.settings.tracks:
             self._observe_tracks(envs)
+        if self._reveals:
+            reveal(egos.box[envs], slots.present[envs], slots.box[envs], traits, self._scales, rows)
+        sensing.delay(self.steps, envs, rows)
 
     def _observe_tracks(self, envs: slice) -> None:
-        egos, slots = self.simulation.egos, self.simulation.slots
-        leader, gap_m = self.simulation.leaders(envs)
+        egos, slots, sensing = self.simulation.egos, self.simulation.slots, self.sensing
+        leader, gap_m = self.simulation.leaders(envs, sensing.seen[envs])
         observe_tracks(
             egos.front_m[envs],
             self.simulation.passed_m,
-            slots.present[envs],
+            sensing.source[envs],
             slots.route[envs],
             slots.box[envs],
             slots.front_m[envs],
             leader,
             gap_m,
-            self._noise_m[envs],
+            sensing.noise_m[envs],
             self.rows[envs],
         )
 

@@ -17,6 +17,8 @@ from tint_sumo.scenes.sumocfg import SumocfgScene
 Observation = dict[str, NDArray[np.float32]]
 OBSERVATION_KEYS = ("ego", "vehicles", "mask")
 TRACKS = ("position_m", "gap_m", "passed")  # per vehicle slot, if they are asked for
+SEEN = ("vehicles", "mask", "traits", "track", *TRACKS)  # what the sensor says of the vehicles, and their traits
+TRUTH = ("track", "true_mask", "true_vehicles", "true_traits")  # per vehicle slot, if the sensor is not perfect
 REWARD_TERMS = ("goal", "collision", "speed", "step")
 Outcome = Literal["success", "timeout", "collision"]
 OUTCOMES: tuple[str, ...] = get_args(Outcome)
@@ -35,9 +37,13 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
             ("vehicles", np.float32, (max_vehicles, 2)),
             ("mask", np.float32, slots),
             ("traits", np.int8, slots),  # number of the driver's profile, or NO_VEHICLE
+            ("track", np.int64, slots),  # number of the track in the episode, or NO_VEHICLE
             ("position_m", np.float64, slots),  # along the route, as observed; 0 in empty slots
             ("gap_m", np.float64, slots),  # gap to the leader, as observed; infinite without one
             ("passed", np.int8, slots),  # 1 where the ego has left the vehicle's route behind
+            ("true_mask", np.int8, slots),  # of the simulation's slots, as they are: 1 where there is a vehicle
+            ("true_vehicles", np.float32, (max_vehicles, 2)),
+            ("true_traits", np.int8, slots),
             ("time_s", np.float64),
             ("outcome", np.int64),
             ("terminated", np.bool_),
@@ -174,9 +180,10 @@ def _bounded(value: float) -> float:
 def observe(
     egos: Boxes,
     speed_mps: Floats,
-    present: Bools,
+    source: Numbers,
     vehicles: Boxes,
     traits: NDArray[np.int8],
+    track: Numbers,
     noise_m: Floats,
     steps: Numbers,
     scales: Scales,
@@ -186,9 +193,11 @@ def observe(
 
     Args:
         egos, speed_mps: (N,).
-        present, vehicles: (N, V) of the vehicle slots.
-        traits: (N, V).
-        noise_m: (N, V, 2) of the positions.
+        source: (N, V) which of the simulation's slots holds the vehicle that each slot of the observation shows;
+            negative where it is empty.
+        vehicles, traits: (N, V) of the simulation's slots.
+        track: (N, V) of the observation's slots.
+        noise_m: (N, V, 2) of the positions in the simulation's slots.
         steps: (N,) since the episodes' start.
     """
     for index in range(len(rows)):
@@ -199,21 +208,41 @@ def observe(
         row.ego[1] = _bounded(ego.y_m / scales.position_m)
         row.ego[2] = _bounded(speed * ego.heading_x)
         row.ego[3] = _bounded(speed * ego.heading_y)
-        for slot in range(present.shape[1]):
-            there, other = present[index, slot], vehicles[index, slot]
-            dx_m = other.x_m - ego.x_m + noise_m[index, slot, 0]
-            dy_m = other.y_m - ego.y_m + noise_m[index, slot, 1]
+        for slot in range(source.shape[1]):
+            shown = source[index, slot]
+            there, other = shown >= 0, vehicles[index, max(shown, 0)]
+            dx_m = other.x_m - ego.x_m + noise_m[index, max(shown, 0), 0]
+            dy_m = other.y_m - ego.y_m + noise_m[index, max(shown, 0), 1]
             row.vehicles[slot, 0] = _bounded(dx_m / scales.position_m) if there else 0.0
             row.vehicles[slot, 1] = _bounded(dy_m / scales.position_m) if there else 0.0
             row.mask[slot] = 1.0 if there else 0.0
-            row.traits[slot] = traits[index, slot]
+            row.traits[slot] = traits[index, shown] if there else -1
+            row.track[slot] = track[index, slot]
+
+
+@compiled
+def reveal(egos: Boxes, present: Bools, vehicles: Boxes, traits: NDArray[np.int8], scales: Scales, rows: Rows) -> None:
+    """Write which vehicles there are and where, seen or not, in the units of observations.
+
+    Args:
+        egos: (N,).
+        present, vehicles, traits: (N, V) of the simulation's slots.
+    """
+    for index in range(len(rows)):
+        row, ego = rows[index], egos[index]
+        for slot in range(present.shape[1]):
+            there, other = present[index, slot], vehicles[index, slot]
+            row.true_mask[slot] = there
+            row.true_vehicles[slot, 0] = _bounded((other.x_m - ego.x_m) / scales.position_m) if there else 0.0
+            row.true_vehicles[slot, 1] = _bounded((other.y_m - ego.y_m) / scales.position_m) if there else 0.0
+            row.true_traits[slot] = traits[index, slot]
 
 
 @compiled
 def observe_tracks(
     ego_front_m: Floats,
     passed_m: Floats,
-    present: Bools,
+    source: Numbers,
     route: Numbers,
     vehicles: Boxes,
     front_m: Floats,
@@ -227,22 +256,52 @@ def observe_tracks(
     Args:
         ego_front_m: (N,).
         passed_m: (K,) see ``tint_sumo.scenes.layout.ConflictZones``.
-        present, route, vehicles, front_m, leader, gap_m: (N, V) of the vehicle slots.
+        source: (N, V) as in ``observe``.
+        route, vehicles, front_m: (N, V) of the simulation's slots.
+        leader, gap_m: (N, V) of the simulation's slots: the next vehicle ahead that is seen, and the gap to it.
         noise_m: (N, V, 2) of the positions.
     """
     for index in range(len(rows)):
         row = rows[index]
-        for slot in range(present.shape[1]):
-            there, this, ahead = present[index, slot], vehicles[index, slot], leader[index, slot]
-            noise_along_m = noise_m[index, slot, 0] * this.heading_x + noise_m[index, slot, 1] * this.heading_y
-            row.position_m[slot] = front_m[index, slot] + noise_along_m if there else 0.0
-            row.gap_m[slot] = math.inf
+        for slot in range(source.shape[1]):
+            row.position_m[slot], row.gap_m[slot], row.passed[slot] = 0.0, math.inf, 0
+            shown = source[index, slot]
+            if shown < 0:
+                continue
+            this, ahead = vehicles[index, shown], leader[index, shown]
+            noise_along_m = noise_m[index, shown, 0] * this.heading_x + noise_m[index, shown, 1] * this.heading_y
+            row.position_m[slot] = front_m[index, shown] + noise_along_m
             if ahead >= 0:
                 other = vehicles[index, ahead]
-                row.gap_m[slot] = gap_m[index, slot] - noise_along_m
+                row.gap_m[slot] = gap_m[index, shown] - noise_along_m
                 row.gap_m[slot] += noise_m[index, ahead, 0] * other.heading_x
                 row.gap_m[slot] += noise_m[index, ahead, 1] * other.heading_y
-            row.passed[slot] = there and ego_front_m[index] > passed_m[route[index, slot]]
+            row.passed[slot] = ego_front_m[index] > passed_m[route[index, shown]]
+
+
+@compiled
+def show_earlier(rows: Rows, frames: Rows, steps: Numbers) -> None:
+    """Put in place of what is seen in rows, which is ``SEEN``, what was seen D steps before, or else at the beginning.
+
+    Args:
+        rows: (N,).
+        frames: (D + 1, N) those of the last steps, written.
+        steps: (N,) since the episodes' start.
+    """
+    kept = len(frames)
+    for index in range(len(rows)):
+        step, row = steps[index], rows[index]
+        frames[step % kept, index] = row
+        earlier = frames[max(step - kept + 1, 0) % kept, index]
+        for slot in range(len(row.mask)):
+            row.vehicles[slot, 0] = earlier.vehicles[slot, 0]
+            row.vehicles[slot, 1] = earlier.vehicles[slot, 1]
+            row.mask[slot] = earlier.mask[slot]
+            row.traits[slot] = earlier.traits[slot]
+            row.track[slot] = earlier.track[slot]
+            row.position_m[slot] = earlier.position_m[slot]
+            row.gap_m[slot] = earlier.gap_m[slot]
+            row.passed[slot] = earlier.passed[slot]
 
 
 def copied(rows: Rows) -> dict[str, NDArray[Any]]:

@@ -73,6 +73,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `position_m`   | with `tracks`: `(V,)` where each vehicle's front is seen on its route; 0 in empty slots     |
     | `gap_m`        | with `tracks`: `(V,)` the gap that is seen to the next vehicle ahead; infinite without one  |
     | `passed`       | with `tracks`: `(V,)` int8, 1 where the ego has left the vehicle's route behind             |
+    | `track`        | with a sensor: `(V,)` number of the slot's track in the episode; -1 in empty slots          |
+    | `true_mask`,   | with a sensor: `(V,)` and `(V, 2)`, the simulation's slots as they are, seen or not, with   |
+    | `true_vehicles`| their traits in `true_traits`: not to be used by policies                                   |
     | `outcome`      | `"success"`, `"collision"`, `"timeout"`, or `""` while the episode goes on                  |
     | `reward_terms` | the reward's named terms (after a step)                                                     |
     | `time_s`       | time since the episode's start                                                              |
@@ -95,7 +98,13 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * `time_limit_s`: default 50 s.
     * `max_episode_steps`: gymnasium's way to say it, in steps of the environment. `gymnasium.make` does not pass it on:
       it wraps the environment in a `TimeLimit`, with which `outcome` stays empty; `gymnasium.make_vec` passes it on.
-    * `position_noise_m`: standard deviation of the noise on the others' x and y, independent per vehicle and step.
+    * `sensor`: how the ego perceives the other vehicles: a `tint_sumo.config.Sensor`, or the name of one in
+      `tint_sumo.config.SENSORS`; default perfect. It may have noise, dropouts, a range, a field of view, occlusion and
+      a delay. `vehicles`, `mask`, and all infos of `tracks` are what it perceives: a vehicle that is not seen has no
+      slot, is nobody's leader, and comes back as a new track. The ego's controller and its safety check, and the
+      drivers, do not look through it.
+    * `position_noise_m`: shorthand of `gymnasium.make` for a sensor that has only this noise: standard deviation of
+      that on the others' x and y, independent per vehicle and step.
     * `tau_s`: time headway of the others' car following (SUMO's `tau`); default the scene's, 1 s in the built-in
       ones.
     * `tracks`: the infos contain the observed positions of vehicles on their routes, too, with the same noise as in

@@ -88,7 +88,9 @@ def layout(scene: Scene) -> Layout:
     Raises:
         InputError: a route does not exist or is not connected, or the scene does not fit its network.
     """
-    same_roads = replace(scene, traffic=Traffic(), population=Population(), time_limit_s=Scene.time_limit_s)
+    same_roads = replace(
+        scene, traffic=Traffic(), population=Population(), time_limit_s=Scene.time_limit_s, buildings=()
+    )
     return replace(_layout(same_roads), scene=scene)
 
 

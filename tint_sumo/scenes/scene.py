@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
+import shapely
+
 from tint_sumo.config import (
     Claim,
     EgoController,
@@ -24,6 +26,8 @@ from tint_sumo.core.errors import InputError, shown
 from tint_sumo.core.ranges import require_ranges
 from tint_sumo.scenes.digest import scene_digest
 from tint_sumo.scenes.network import Network, Point
+
+Building = tuple[Point, ...]  # its corners, in order
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,7 @@ class Scene:
     step_s: StepS = 0.1  # code; SUMO counts whole milliseconds
     time_limit_s: TimeS = 50.0  # code
     base: str = ""  # name of the built-in scene that it is with other numbers
+    buildings: tuple[Building, ...] = ()  # they hide vehicles from a sensor with occlusion, and change nothing else
 
     sumocfg: ClassVar[Path | None] = None  # the SUMO configuration whose traffic it has: none
 
@@ -97,6 +102,11 @@ class Scene:
                 raise InputError(
                     f"desired_speed_mps of {profile.name} must not exceed the roads' limit of "
                     f"{self.network.speed_limit_mps:g} m/s, {profile.desired_speed_mps[1]:g} m/s does"
+                )
+        for building in self.buildings:
+            if len(building) < 3 or not shapely.Polygon(building).is_valid:
+                raise InputError(
+                    f"a building must have three corners or more, and a simple outline, not {shown(building)}"
                 )
         if not self.step_s <= self.tau_s < math.inf:  # with less, SUMO's drivers hit each other
             raise InputError(f"tau_s must be at least a step of {self.step_s:g} s, and finite, not {self.tau_s}")
@@ -132,7 +142,7 @@ class Scene:
 
     @property
     def digest(self) -> str:
-        """Digest of the roads, the vehicles and the ego's task; drivers and their mix do not count."""
+        """Digest of the roads, the vehicles and the ego's task; drivers, their mix and buildings do not count."""
         return scene_digest(self)
 
 

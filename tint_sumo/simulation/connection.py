@@ -39,6 +39,7 @@ class Connection:
     vehicletype: Any
     person: Any
     route: Any
+    polygon: Any
     simulation: Any
     lane_position_m: Callable[[str], float]  # vehicle.getLanePosition, which is called more often than all else
     step: Callable[..., Any]  # one step or, with a time, all steps until then
@@ -101,6 +102,7 @@ def _libsumo(options: Sequence[str]) -> Connection:
                 libsumo.vehicletype,
                 libsumo.person,
                 libsumo.route,
+                libsumo.polygon,
                 libsumo.simulation,
                 lane_position_m,
                 libsumo.simulationStep,
@@ -150,6 +152,7 @@ def _traci(options: Sequence[str]) -> Connection:
                 connection.vehicletype,
                 connection.person,
                 connection.route,
+                connection.polygon,
                 connection.simulation,
                 connection.vehicle.getLanePosition,
                 connection.simulationStep,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tint_sumo.scenes.geometry import Floats, Numbers, find_leaders, follow
+from tint_sumo.scenes.geometry import Bools, Floats, Numbers, find_leaders, follow
 from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.slots import Slots
 
@@ -51,13 +51,13 @@ class LanePositions:
         self.stage[replica] = 0
         self._lane_pos_m[replica] = 0.0
 
-    def leaders(self, replicas: slice) -> tuple[Numbers, Floats]:
-        """Return the leaders' slots and the gaps to them, as in ``Simulation.leaders``."""
+    def leaders(self, replicas: slice, among: Bools) -> tuple[Numbers, Floats]:
+        """Return the leaders' slots and the gaps to them, as in ``Simulation.leaders``, among some vehicles (R, V)."""
         layout, slots = self._layout, self._slots
         route = slots.route[replicas]
         leader, gap_m = np.empty(route.shape, np.int64), np.empty(route.shape)
         find_leaders(
-            slots.present[replicas],
+            among,
             route,
             self.stage[replicas],
             slots.front_m[replicas],

@@ -12,10 +12,11 @@ import numpy as np
 from tint_sumo.config import Backend
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.drivers import members
-from tint_sumo.scenes.geometry import Floats, Numbers, place
+from tint_sumo.scenes.geometry import Bools, Floats, Numbers, place
 from tint_sumo.scenes.layout import layout
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import Scene, View
+from tint_sumo.scenes.sight import walls_of
 from tint_sumo.simulation.demand import Demand, PlacedVehicle
 from tint_sumo.simulation.lanes import LanePositions
 from tint_sumo.simulation.simulation import Simulation
@@ -49,6 +50,7 @@ class SceneSimulation(Simulation):
         profiles = scene.population.profiles
         self.trait_of_member = np.array([profiles.index(member.profile) for member in self.population])
         self.passed_m = self.layout.zones.passed_m
+        self.walls = walls_of(scene.buildings)
         self._with_ego = with_ego
         self.link = SumoLink(self.layout, replicas, backend, collision_options)
         self.connection = self.link.connection
@@ -156,5 +158,5 @@ class SceneSimulation(Simulation):
             if slot >= 0:
                 self._add(replica, slot, self._demand.take(replica, route, float(self.time_s[replica])))
 
-    def leaders(self, replicas: slice = slice(None)) -> tuple[Numbers, Floats]:
-        return self.lanes.leaders(replicas)
+    def leaders(self, replicas: slice = slice(None), seen: Bools | None = None) -> tuple[Numbers, Floats]:
+        return self.lanes.leaders(replicas, self.slots.present[replicas] if seen is None else seen)

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 
-from tint_sumo.scenes.geometry import Floats, Numbers
+from tint_sumo.scenes.geometry import Bools, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import Scene, View
 from tint_sumo.scenes.sumocfg import SumocfgScene
@@ -22,6 +22,7 @@ class Simulation(ABC):
     connection: Connection
     trait_of_member: Numbers  # number of the trait of each member of the population
     passed_m: Floats  # (K,) front of an ego that has left each route of the traffic behind
+    walls: Floats  # (W, 4) of buildings, as ``tint_sumo.scenes.sight.walls_of`` returns them
     origin_m = (0.0, 0.0)  # position of the scene's origin in the network
 
     def __init__(self, replicas: int, scene: Scene | SumocfgScene) -> None:
@@ -60,10 +61,11 @@ class Simulation(ABC):
         """Advance all replicas by one step; (R,) desired speeds of the egos."""
 
     @abstractmethod
-    def leaders(self, replicas: slice = slice(None)) -> tuple[Numbers, Floats]:
+    def leaders(self, replicas: slice = slice(None), seen: Bools | None = None) -> tuple[Numbers, Floats]:
         """Return the slot of the next vehicle ahead of each vehicle, and the gap to it from bumper to bumper.
 
-        Both (R, V) of some replicas: ``NO_VEHICLE`` and infinite where no slot holds one.
+        Both (R, V) of some replicas: ``NO_VEHICLE`` and infinite where no slot holds one. With ``seen`` (R, V) as if
+        no other vehicles were there.
         """
 
     @abstractmethod

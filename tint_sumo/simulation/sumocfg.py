@@ -18,9 +18,11 @@ from traci.exceptions import FatalTraCIError, TraCIException
 
 from tint_sumo.config import NO_LEADER_GAP_M, Backend
 from tint_sumo.core.errors import InputError
-from tint_sumo.scenes.geometry import NO_VEHICLE, Floats, Numbers
+from tint_sumo.scenes.buildings import BUILDING
+from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
-from tint_sumo.scenes.scene import View
+from tint_sumo.scenes.scene import Building, View
+from tint_sumo.scenes.sight import walls_of
 from tint_sumo.scenes.sumocfg import DEFAULT_VTYPE, SumocfgScene, SumoConfig, network_roads
 from tint_sumo.simulation.connection import Connection, connect
 from tint_sumo.simulation.simulation import Simulation
@@ -135,6 +137,7 @@ class SumocfgSimulation(Simulation):
         super().__init__(replicas, scene)
         self.trait_of_member = np.arange(len(scene.vtypes))
         self.passed_m = np.array([np.inf])  # no vehicle's way is ever left behind
+        self.walls = walls_of(())
         with refusals(scene.config):
             self.connection = connect(sumo_options(scene.config, seed=0), backend)
         self.warm_starts = WarmStarts(scene, self.connection, partial(sumo_options, scene.config))
@@ -174,7 +177,15 @@ class SumocfgSimulation(Simulation):
         ego = self.egos.box[0]
         _write_box(ego, sight, (0.0, 0.0))
         self.origin_m = (float(ego["x_m"]), float(ego["y_m"]))
+        self.walls = walls_of(self._buildings()) - np.tile(self.origin_m, 2)
         self._look()
+
+    def _buildings(self) -> Iterator[Building]:
+        """Yield the polygons of the configuration's additional files whose type is building, or begins with it."""
+        polygons = self.connection.polygon
+        for polygon in polygons.getIDList():
+            if polygons.getType(polygon).startswith(BUILDING):
+                yield tuple(polygons.getShape(polygon))
 
     def clear(self, replica: int) -> None:
         self._drives = False
@@ -280,12 +291,13 @@ class SumocfgSimulation(Simulation):
         vehicle_id = next(known for known, taken in self.slot.items() if taken == slot)
         return str(self.connection.vehicle.getRoadID(vehicle_id))
 
-    def leaders(self, replicas: slice = slice(None)) -> tuple[Numbers, Floats]:
+    def leaders(self, replicas: slice = slice(None), seen: Bools | None = None) -> tuple[Numbers, Floats]:
         shape = self.slots.present.shape
+        known = self.slots.present if seen is None else seen
         leader, gap_m = np.full(shape, NO_VEHICLE), np.full(shape, np.inf)
         for vehicle_id, slot in self.slot.items():
             ahead_id, ahead_m = leader_of(self.connection, vehicle_id, self._kinds.of(vehicle_id))
-            if ahead_id in self.slot:
+            if ahead_id in self.slot and known[0, self.slot[ahead_id]]:
                 leader[0, slot], gap_m[0, slot] = self.slot[ahead_id], ahead_m
         return leader[replicas], gap_m[replicas]
 

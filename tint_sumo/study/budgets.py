@@ -14,6 +14,7 @@ from tint_sumo.config import (
     NoiseM,
     PpoSettings,
     Seed,
+    Sensor,
     TauS,
     TraitSettings,
 )
@@ -48,7 +49,7 @@ class Conditions:
 
     def task(self, scene: AnyScene) -> TaskSettings:
         """Return the settings of environments in a scene."""
-        return TaskSettings(scene, self.p_conservative, position_noise_m=self.position_noise_m, tau_s=self.tau_s)
+        return TaskSettings(scene, self.p_conservative, sensor=Sensor(noise_m=self.position_noise_m), tau_s=self.tau_s)
 
     def resolved(self, scene_tau_s: float) -> "Conditions":
         """Return these conditions with the headway of the scene's drivers where none is given."""

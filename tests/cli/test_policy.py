@@ -24,7 +24,7 @@ def test_policy_train(
 ) -> None:
     out = tmp_path / "run"
     train = ("policy", "train", "--method", "vae", "--config", small_training)
-    argv = (*train, "--steps", 1, "--traits", trait_model, "--out", out)
+    argv = (*train, "--steps", 1, "--traits", trait_model, "--out", out, "--sensor", "noisy_0.1")
     printed = run(capsys, *argv, "--p-conservative", 0.25)
     assert printed == {
         "model": str(out / "policy.safetensors"), "method": "vae", "p_conservative": [0.25], "steps": 1, "seed": 0
@@ -33,7 +33,9 @@ def test_policy_train(
     assert "another run" in refuse(capsys, *argv, "--p-conservative", 0.3)
     assert files(out) == before
     found = run(capsys, "policy", "evaluate", "--model", out, "--episodes", 2)
-    assert found["p_conservative"] == 0.25
+    assert (found["p_conservative"], found["sensor"]) == (0.25, "noisy_0.1")
+    argv = ("policy", "evaluate", "--model", out, "--episodes", 2, "--sensor", "perfect")
+    assert run(capsys, *argv)["sensor"] == "perfect"
 
 
 def test_a_pickled_policy_is_read_on_request_alone(
@@ -68,6 +70,19 @@ def test_policies_are_evaluated_in_other_traffic(capsys: pytest.CaptureFixture[s
     assert plain["p_conservative"] == other["p_conservative"] == [0.2, 0.8]
     assert (other["position_noise_m"], other["tau_s"]) == (0.2, 0.5)
     assert plain["navigation_time_s"] != other["navigation_time_s"]
+
+
+def test_policies_are_evaluated_with_other_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ("policy", "evaluate", "--model", "ttc", "--episodes", 6, "--p-conservative", 0.2, 0.8)
+    near = run(capsys, *argv, "--sensor", "range_15", "--noise", 0.05)
+    assert near["sensor"]["range_m"] == 15.0 and near["position_noise_m"] == near["sensor"]["noise_m"] == 0.05
+    file = tmp_path / "config.yaml"
+    file.write_text("sensor: {base: range_15, noise_m: 0.05}")
+    assert run(capsys, *argv, "--config", file) == near
+    file.write_text("sensor: {base: noisy_0.2, range: 3}")
+    assert "sensor.range: there is no such setting" in refuse(capsys, *argv, "--config", file)
+    assert "--noise is 0.1 m, and 0.2 m in the sensor" in refuse(capsys, *argv, "--sensor", "noisy_0.2", "--noise", 0.1)
+    assert run(capsys, *argv, "--sensor", "noisy_0.2", "--noise", 0.2)["sensor"] == "noisy_0.2"
 
 
 def test_damaged_models(dataset: Path, trait_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,7 @@ from tests.bombs import BOMBS, bomb
 from tests.methods import runs
 from tests.simulation.scenes import T
 from tint_sumo import traits
-from tint_sumo.config import Mix, PolicySettings, PpoSettings, TraitSettings
+from tint_sumo.config import SENSORS, Mix, PolicySettings, PpoSettings, TraitSettings
 from tint_sumo.core.checkpoints import CHECKPOINT_FILE, PICKLES
 from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import DivergedError, InputError
@@ -444,6 +444,14 @@ def test_a_film_of_a_policy_that_has_diverged_says_at_which_step(
 
 
 # Folders and arguments
+
+
+def test_a_training_with_another_sensor_is_another_run(tmp_path: Path, tiny: PpoSettings) -> None:
+    policy = train_policy("oracle", Mix(0.4), 64, 0, tmp_path, settings=tiny, sensor=SENSORS["range_15"])
+    assert read_policy_card(policy.with_suffix(""))["sensor"]["range_m"] == 15.0
+    assert load_policy(tmp_path).task.sensor == SENSORS["range_15"]
+    with pytest.raises(InputError, match=r"another run \(different: sensor\)"):
+        train_policy("oracle", Mix(0.4), 64, 0, tmp_path, settings=tiny)
 
 
 def test_another_run_s_folder_is_refused(tmp_path: Path, tiny: PpoSettings) -> None:

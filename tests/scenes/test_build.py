@@ -1,12 +1,15 @@
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from sumolib.shapes import polygon
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
 from tint_sumo.scenes import SCENES, T_INTERSECTION, find_scene
-from tint_sumo.scenes.build import CONFIG_FILE, NET_FILE, scene_files, write_scene
+from tint_sumo.scenes.build import BUILDINGS_FILE, CONFIG_FILE, NET_FILE, scene_files, write_scene
+from tint_sumo.scenes.buildings import corner_buildings
 from tint_sumo.scenes.network import sumo_program
 
 T = find_scene(T_INTERSECTION)
@@ -27,6 +30,20 @@ def test_plain_sumo_runs_every_scene(name: str, routes: str, tmp_path: Path) -> 
     inserted = next(line for line in result.stdout.splitlines() if "Inserted:" in line)
     assert int(inserted.split()[1]) > 10
     assert "collision" not in result.stderr.lower()
+
+
+def test_buildings_are_polygons_that_sumo_reads(tmp_path: Path) -> None:
+    scene = replace(T, buildings=corner_buildings(T, 1.5))
+    write_scene(tmp_path, scene, replicas=2)
+    polygons = [(one.id, one.type, one.shape) for one in polygon.read(str(tmp_path / BUILDINGS_FILE))]
+    assert [(name, kind) for name, kind, _ in polygons] == [
+        (f"building{number}.{replica}", "building") for replica in (0, 1) for number in (0, 1)
+    ]
+    assert [tuple(shape) for _, _, shape in polygons[:2]] == list(scene.buildings)
+    assert [(x_m - 128.0, y_m) for x_m, y_m in polygons[2][2]] == list(scene.buildings[0])
+    command = [sumo_program("sumo"), "-c", str(tmp_path / CONFIG_FILE), "--end", "1"]
+    subprocess.run(command, capture_output=True, check=True)
+    assert BUILDINGS_FILE not in scene_files(T, replicas=1)
 
 
 def test_rebuilding_replaces_written_files_and_no_others(tmp_path: Path) -> None:

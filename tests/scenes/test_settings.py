@@ -21,6 +21,7 @@ from tint_sumo.scenes import (
     read_scene,
     scene_settings,
 )
+from tint_sumo.scenes.buildings import corner_buildings
 from tint_sumo.scenes.drivers import read_population
 
 SHY = {
@@ -84,6 +85,26 @@ def test_a_card_contains_all_settings_of_a_changed_scene() -> None:
     assert read_described(card) == (scene,)
     assert set(described([find_scene("four_way")])) == {"scene", "scene_digest"}
     assert read_described(described(find_scenes(ALL_SCENES))) == find_scenes(ALL_SCENES)
+
+
+def test_buildings_change_neither_the_digest_nor_the_names_of_scenes_without_them() -> None:
+    shed = [[8, -8], [12, -8], [12, -12]]
+    corners, shacks = changed(buildings=2), changed(buildings=[shed, shed])
+    assert [len(scene.buildings) for scene in (corners, shacks)] == [4, 2]
+    assert corners.digest == shacks.digest == find_scene("four_way").digest
+    assert corners.buildings == corner_buildings(find_scene("four_way"), 2.0)
+    assert len({corners.name, shacks.name, changed(buildings=3).name}) == 3
+    assert changed(time_limit_s=20).name == "four_way-50c424"  # as in cards of earlier versions
+    for scene in (corners, shacks):
+        assert read_described(described([scene])) == (scene,)
+
+
+@pytest.mark.parametrize(
+    "buildings", [[[[0, 0], [1, 0]]], [[[0, 0], [1, 1], [1, 0], [0, 1]]], [[0, 0], [1, 0], [1, 1]], -1, "corners"]
+)
+def test_buildings_without_sense_are_refused(buildings: Any) -> None:
+    with pytest.raises(InputError, match="buildings"):
+        changed(buildings=buildings)
 
 
 def test_a_sumo_configuration(user_network: Callable[[str], UserNetwork]) -> None:

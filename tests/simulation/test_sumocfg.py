@@ -189,6 +189,39 @@ def test_a_cleared_simulation_stands_still(user_network: Make) -> None:
         assert not simulation.slots.present.any()
 
 
+def test_polygons_of_the_type_building_are_walls_around_the_ego(user_network: Make) -> None:
+    network = user_network("merge")
+    folder = network.sumocfg.parent
+    (folder / "shapes.add.xml").write_text(
+        '<additional><poly id="house" type="building.yes" shape="100,10 120,10 120,30"/>'
+        '<poly id="pond" type="water" shape="0,10 20,10 20,30"/></additional>'
+    )
+    more = '<additional-files value="shapes.add.xml"/><step-length value="0.1"/>'
+    sumocfg = write_config(folder / "built.sumocfg", "merge.net.xml", "merge.rou.xml", more)
+    with begun(replace(network, sumocfg=sumocfg).scene(warm_up_s=1.0)) as simulation:
+        walls = simulation.walls + np.tile(simulation.origin_m, 2)
+    assert walls[:3].tolist() == [[100.0, 10.0, 120.0, 10.0], [120.0, 10.0, 120.0, 30.0], [120.0, 30.0, 100.0, 10.0]]
+    assert np.unique(walls, axis=0).shape == (3, 4)
+
+
+def test_a_hidden_leader_is_none_and_the_next_one_ahead_is_it(user_network: Make) -> None:
+    found = 0
+    with begun(user_network("autobahn").scene()) as simulation:
+        for _ in drive(simulation, 60):
+            leader, gap_m = simulation.leaders()
+            for slot in np.flatnonzero(leader[0] >= 0).tolist():
+                ahead = int(leader[0, slot])
+                seen = simulation.slots.present.copy()
+                seen[0, ahead] = False
+                now, now_m = simulation.leaders(seen=seen)
+                further, length_m = int(leader[0, ahead]), simulation.slots.length_m[0, ahead]
+                if gap_m[0, slot] + length_m < 15.0:
+                    assert now[0, slot] == further
+                    assert now_m[0, slot] == pytest.approx(gap_m[0, slot] + length_m + gap_m[0, ahead])
+                    found += further >= 0
+    assert found > 10
+
+
 def test_the_end_of_the_route_is_past_the_goal(user_network: Make) -> None:
     network = user_network("merge")
     end_m = network.scene().route_edge_start_m[1] + 145.0

@@ -18,12 +18,15 @@ from tint_sumo.cli.values import (
     PpoBudgetValue,
     Scene,
     SceneValue,
+    SensorValue,
     TestMix,
     TestScene,
+    TestSensor,
     TestTau,
     optional,
 )
-from tint_sumo.config import Decisions, Mix, NoiseM, Seed, Sensor
+from tint_sumo.config import SENSORS, Decisions, Mix, NoiseM, Seed, Sensor
+from tint_sumo.core.errors import InputError
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.ranges import Processes
 from tint_sumo.core.stores import name_in, working_folder
@@ -42,6 +45,7 @@ _TRAITS = optional(
     ".safetensors file.",
     "the method's shipped one",
 )
+_SENSOR = arg(help=f"Sensor that the ego perceives the others with: {', '.join(SENSORS)}.")
 _SET = arg(
     metavar="NAME=VALUE,VALUE [NAME=VALUE,VALUE ...]",
     help="Values of PPO's settings, all behind one --set, such as learning_rate=0.001,0.003 n_epochs=2,4; names of the "
@@ -69,6 +73,7 @@ class TrainPolicy(Command):
     """Seed of the training, 0 to 1000."""
     budget: PpoBudgetValue = "full"
     """Size of the network, settings of PPO and number of decisions; full takes 5 to 8 minutes on a free core."""
+    sensor: Annotated[SensorValue, _SENSOR] = "perfect"
     scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}, or all of them at once: all.")] = "t_intersection"
     traits: Annotated[str | None, _TRAITS] = None
     other_scene: bool = False
@@ -77,6 +82,7 @@ class TrainPolicy(Command):
     """Also write Stable-Baselines3's policy.zip, a pickle: whoever reads it must trust you."""
 
     def run(self) -> Outcome:
+        from tint_sumo.envs.episodes import find_sensor
         from tint_sumo.films.training_films import film_policy
         from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.training import train_policy
@@ -97,6 +103,7 @@ class TrainPolicy(Command):
                 self.out,
                 settings=settings,
                 scene=self.scene,
+                sensor=find_sensor(self.sensor),
                 traits=self.traits,
                 other_scene=self.other_scene,
                 with_zip=self.zip,
@@ -114,8 +121,9 @@ class EvaluatePolicy(SpreadCommand):
     model: PolicyName
     p_conservative: TestMix = None
     scene: TestScene = None
+    sensor: TestSensor = None
     noise: NoiseM = 0.0
-    """Standard deviation of the noise on the others' positions, m."""
+    """Standard deviation of the noise on the others' positions, m, with a sensor that has none."""
     tau: TestTau = None
     episodes: Cases = 500
     """Number of cases."""
@@ -133,7 +141,7 @@ class EvaluatePolicy(SpreadCommand):
 
         use_one_thread()
         contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
-        task = task_of(contender, self.p_conservative, self.noise, self.tau)
+        task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau)
         with self.workers_of(1) as workers:
             if isinstance(workers, int):
                 with one_job(f"evaluate {self.model}") as report:
@@ -215,11 +223,28 @@ class Policy:
 
 
 def task_of(
-    contender: "Contender", p_conservative: MixFlag | None, noise_m: float, tau_s: float | None
+    contender: "Contender",
+    p_conservative: MixFlag | None,
+    sensor: "str | Sensor | None",
+    noise_m: float,
+    tau_s: float | None,
 ) -> "TaskSettings":
-    """Return the settings of the environments that flags ask for; what is not given is as in the policy's training."""
+    """Return the settings of the environments that flags ask for; what is not given is as in the policy's training.
+
+    Raises:
+        InputError: there are two noises.
+    """
+    from tint_sumo.envs.episodes import find_sensor
+
     mix = contender.p_conservative if p_conservative is None else Mix.parse(p_conservative)
-    return replace(contender.task, p_conservative=mix, sensor=Sensor(noise_m=noise_m), tau_s=tau_s)
+    task = replace(contender.task, p_conservative=mix, tau_s=tau_s)
+    if sensor is not None:
+        task = replace(task, sensor=find_sensor(sensor))
+    if noise_m == 0.0:
+        return task
+    if task.sensor.noise_m not in (0.0, noise_m):
+        raise InputError(f"`noise` is {noise_m:g} m, and {task.sensor.noise_m:g} m in the sensor; give it once")
+    return replace(task, sensor=replace(task.sensor, noise_m=noise_m))
 
 
 def content_of(task: "TaskSettings") -> dict[str, Any]:
@@ -227,6 +252,7 @@ def content_of(task: "TaskSettings") -> dict[str, Any]:
     return {
         "scene": task.scene.name,
         "p_conservative": plain(task.p_conservative),
+        "sensor": next((name for name, known in SENSORS.items() if known == task.sensor), plain(task.sensor)),
         "position_noise_m": task.sensor.noise_m,
         "tau_s": task.played.tau_s,
     }

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tint_sumo.cli.command import Command, Outcome, use_one_thread
 from tint_sumo.cli.policy import content_of, task_of
-from tint_sumo.cli.values import PolicyName, TestMix, TestScene, TestTau
+from tint_sumo.cli.values import PolicyName, TestMix, TestScene, TestSensor, TestTau
 from tint_sumo.config import NoiseM, Seed
 from tint_sumo.core.ranges import Range
 
@@ -24,8 +24,10 @@ class Render(Command):
     seed: Seed = 0
     """Number of the case set, 0 to 1000."""
     scene: TestScene = None
+    sensor: TestSensor = None
     noise: NoiseM = 0.0
-    """Standard deviation of the noise on the others' positions, m; the film shows them without noise."""
+    """Standard deviation of the noise on the others' positions, m, with a sensor that has none; the film
+    shows them without noise."""
     tau: TestTau = None
     allow_pickle: bool = False
     """Read .zip files, which can run any code: for files that you trust alone."""
@@ -38,7 +40,7 @@ class Render(Command):
         require_film_file(self.out)
         use_one_thread()
         contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
-        task = task_of(contender, self.p_conservative, self.noise, self.tau)
+        task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau)
         with one_job(f"render {self.out}") as report:
             film = render_case(contender, self.case, self.out, case_set=self.seed, task=task, report=report)
         text = f"{film.outcome} after {film.time_s:.1f} s, {film.frames} frames: {self.out}"

@@ -7,9 +7,9 @@ from tyro.conf import arg
 
 from tint_sumo import ENV_IDS
 from tint_sumo.cli.configuration import FromFile, name_flag, one_of
-from tint_sumo.config import Fraction, TauS
+from tint_sumo.config import SENSORS, Fraction, TauS
 from tint_sumo.core.ranges import Range
-from tint_sumo.core.structures import Many, Where
+from tint_sumo.core.structures import Many, Where, choose
 
 
 def optional(metavar: str, text: str, default: str = "none") -> Any:
@@ -52,7 +52,16 @@ def _population_in_full(value: Any) -> Any:
     return find_population(value) if isinstance(value, str) else value
 
 
+def _read_sensor(value: Any, where: Where) -> Any:
+    return None if value is None else choose(value, SENSORS, "perfect", where)
+
+
+def _sensor_in_full(value: Any) -> Any:
+    return SENSORS[value] if isinstance(value, str) else value
+
+
 SCENE = FromFile(_read_scene, _scene_in_full)
+SENSOR = FromFile(_read_sensor, _sensor_in_full)
 POPULATION = FromFile(_read_population, _population_in_full)
 BUDGET = one_of("tint_sumo.study.budgets", "BUDGETS", "quick")
 PPO_BUDGET = one_of("tint_sumo.config", "PPO_BUDGETS", "full")
@@ -64,6 +73,7 @@ FolderOrUrl = Annotated[str, arg(metavar="FOLDER|URL")]  # a path would lose a s
 
 # Values are names, or what these make of a file.
 SceneValue = Annotated[Any, name_flag(), SCENE]
+SensorValue = Annotated[Any, name_flag(*SENSORS), SENSOR]
 PopulationValue = Annotated[Any, name_flag("traits", "continuous"), POPULATION]
 BudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), BUDGET]
 PpoBudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), PPO_BUDGET]
@@ -97,6 +107,10 @@ TestMix = Annotated[
 ]
 TestScene = Annotated[
     SceneValue, optional("NAME", f"Scene: {SCENES}.", "the policy's; t_intersection for always_go and ttc")
+]
+TestSensor = Annotated[
+    SensorValue,
+    optional("NAME", f"Sensor that the ego perceives the others with: {', '.join(SENSORS)}.", "as in its training"),
 ]
 TestTau = Annotated[
     TauS | None, optional("FLOAT", "Time headway of the other drivers, s.", "the scene's, 1 s in built-in scenes")

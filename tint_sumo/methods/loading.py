@@ -13,10 +13,11 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits
-from tint_sumo.config import LATENT_SIZE, Mix, Traffic
+from tint_sumo.config import LATENT_SIZE, PERFECT, Mix, Sensor, Traffic
 from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import InputError, NotFiniteError
 from tint_sumo.core.files import shipped
+from tint_sumo.core.structures import FieldError, build
 from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.registry import METHODS, Learned, Policy, Rule, find_learned
 from tint_sumo.methods.rules import ACTIONS as RULE_ACTIONS
@@ -40,6 +41,7 @@ class Contender:
     scene: AnyScene  # what it drives in
     source: Callable[[], TraitSource] | None = None  # source of the traits in its observations; None: it has no traits
     p_conservative: Mix | None = Traffic.p_conservative  # what it was trained for; None in a SUMO configuration
+    sensor: Sensor = PERFECT  # what it was trained with
     action_repeat: int = 1  # simulation steps per decision
     method: str = ""  # name of the method in the registry
 
@@ -50,7 +52,7 @@ class Contender:
         Each case of a SUMO configuration has a warm-up of its own, so that no traffic is that of the training.
         """
         scene = replace(self.scene, warm_starts=0) if isinstance(self.scene, SumocfgScene) else self.scene
-        return TaskSettings(scene, self.p_conservative)
+        return TaskSettings(scene, self.p_conservative, sensor=self.sensor)
 
     def make_venv(self, num_envs: int, task: TaskSettings, *, on_step: OnStep | None = None) -> VecEnv:
         """Return environments with the observations that the policy takes.
@@ -152,6 +154,7 @@ def _contender(stem: Path, policy: GruPolicy | RecurrentPPO) -> Contender:
         read_described(card)[0],
         lambda: learned.make_source(encoder),
         None if card["p_conservative"] is None else Mix.parse(card["p_conservative"]),
+        build(Sensor, card.get("sensor", {}), ("sensor",)),
         int(card["settings"]["action_repeat"]),
         learned.name,
     )
@@ -225,6 +228,7 @@ def _checked_card(stem: Path) -> dict[str, Any]:
     fits = isinstance(method, Learned) and (_is_mix(mix) or (mix is None and "scene_settings" in card))
     fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
     fits &= "scene_settings" in card or str(card.get("scene")) in (*SCENES, ALL_SCENES)
+    fits &= _is_sensor(card.get("sensor", {}))
     if not fits or (isinstance(method, Learned) and method.encoder and not _is_file_name(card.get("traits"))):
         raise InputError(f"{card_file(stem)} is not the card of a policy; restore the file or train the policy again")
     return card
@@ -234,6 +238,14 @@ def _is_mix(value: object) -> bool:
     try:
         Mix.parse(value)
     except InputError:
+        return False
+    return True
+
+
+def _is_sensor(value: object) -> bool:
+    try:
+        build(Sensor, value)
+    except FieldError:
         return False
     return True
 

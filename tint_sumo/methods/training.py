@@ -18,13 +18,14 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits as trait_models
-from tint_sumo.config import LATENT_SIZE, SEEDS, SNAPSHOTS_PERCENT, Mix, PpoSettings
+from tint_sumo.config import LATENT_SIZE, PERFECT, SEEDS, SNAPSHOTS_PERCENT, Mix, PpoSettings, Sensor
 from tint_sumo.core.checkpoints import remove_checkpoint, write_checkpoint
 from tint_sumo.core.determinism import preserved_random_state, single_threaded
 from tint_sumo.core.errors import DivergedError, InputError, NotFiniteError
 from tint_sumo.core.files import claim_folder, write_text
 from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.core.provenance import versions
+from tint_sumo.core.structures import plain
 from tint_sumo.core.training_log import log_film, open_log
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.rows import OUTCOMES
@@ -63,6 +64,7 @@ def train_policy(
     *,
     settings: PpoSettings,
     scene: str | AnyScene = T_INTERSECTION,
+    sensor: Sensor = PERFECT,
     traits: str | Path | None = None,
     other_scene: bool = False,
     with_zip: bool = False,
@@ -86,6 +88,7 @@ def train_policy(
         out: a new folder, or the one of this very run.
         settings: network and PPO; its ``total_steps`` is not used.
         scene: the scene it trains in, or ``"all"``.
+        sensor: with which the ego perceives the others.
         traits: trait model by name or path, for methods that infer traits; the shipped one if not given.
         other_scene: take a trait model that was trained in another scene, too.
         with_zip: write the policy as Stable-Baselines3's policy.zip, too.
@@ -120,6 +123,7 @@ def train_policy(
         "steps": steps,
         "seed": seed,
         **trained_in,
+        **({} if sensor == PERFECT else {"sensor": plain(sensor)}),
         "settings": asdict(settings),
         "traits": None if encoder is None else digest(encoder),
     }
@@ -134,7 +138,7 @@ def train_policy(
             if encoder is not None:
                 save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)).entries)
             card = _card(identity, encoder)
-            venv = training_venv(learned, encoder, p_conservative, settings, scenes)
+            venv = training_venv(learned, encoder, p_conservative, settings, scenes, sensor)
             try:
                 with preserved_random_state(), single_threaded():
                     model = _learn(venv, steps, seed, out, settings, card, film, report)
@@ -191,6 +195,7 @@ def training_venv(
     p_conservative: Mix | None,
     settings: PpoSettings,
     scenes: Sequence[AnyScene],
+    sensor: Sensor = PERFECT,
 ) -> VecEnv:
     """Return environments with the traits that the method is trained with."""
     time_limit_s = min(settings.time_limit_s, *(scene.time_limit_s for scene in scenes))
@@ -198,7 +203,7 @@ def training_venv(
     return policy_venv(
         settings.n_envs,
         shown.make_source(encoder if shown.encoder else None),
-        [TaskSettings(scene, p_conservative, time_limit_s=time_limit_s) for scene in scenes],
+        [TaskSettings(scene, p_conservative, time_limit_s=time_limit_s, sensor=sensor) for scene in scenes],
         action_repeat=settings.action_repeat,
         critic_sees_true_traits=learned.critic_sees_true_traits,
         monitored=True,

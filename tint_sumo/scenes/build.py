@@ -6,15 +6,17 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import require_output_folder, write_text
 from tint_sumo.scenes.drivers import DISTRIBUTION_ID, vtypes_xml
 from tint_sumo.scenes.layout import EGO
-from tint_sumo.scenes.network import REPLICA_SPACING_M, build_network, name, plain_xml
-from tint_sumo.scenes.scene import Scene
+from tint_sumo.scenes.network import REPLICA_SPACING_M, build_network, name, plain_xml, replica_origin
+from tint_sumo.scenes.scene import BUILDING, Scene
 
 NET_FILE = "tint.net.xml"
 DRIVERS_FILE = "drivers.add.xml"
 ROUTES_FILE = "routes.add.xml"
+BUILDINGS_FILE = "buildings.add.xml"  # of a scene that has buildings
 CONFIG_FILE = "tint.sumocfg"
 DEMO_POISSON_RATE_PER_S = 0.2  # per route; about two thirds of saturation
 _SATURATED_RATE_PER_S = 1.0  # more than a road can take: drivers for whom there is no room do not wait
+_BUILDING_COLOUR = "168,158,146"
 _WRITTEN_BY = "<!-- Written by tint-sumo net"
 _MARK = f"{_WRITTEN_BY}; change tint_sumo/scenes and run it again. -->\n"
 
@@ -37,8 +39,10 @@ def scene_files(scene: Scene, replicas: int, spacing_m: float = REPLICA_SPACING_
         ROUTES_FILE: _routes_xml(scene, replicas),
         "saturated.rou.xml": _flows_xml(scene, replicas, f"exp({_SATURATED_RATE_PER_S:g})"),
         "poisson.rou.xml": _flows_xml(scene, replicas, f"exp({DEMO_POISSON_RATE_PER_S:g})"),
-        CONFIG_FILE: _config_xml(scene.step_s),
+        CONFIG_FILE: _config_xml(scene),
     }
+    if scene.buildings:
+        texts[BUILDINGS_FILE] = _buildings_xml(scene, replicas, spacing_m)
     return {file: _marked(text) for file, text in texts.items()}
 
 
@@ -90,17 +94,29 @@ def _flows_xml(scene: Scene, replicas: int, period: str) -> str:
     return "\n".join(["<routes>", *lines, "</routes>", ""])
 
 
-def _config_xml(step_s: float) -> str:
+def _buildings_xml(scene: Scene, replicas: int, spacing_m: float) -> str:
+    lines = [
+        f'    <poly id="{name(f"{BUILDING}{number}", replica)}" type="{BUILDING}" color="{_BUILDING_COLOUR}" fill="1" '
+        f'layer="0" shape="{" ".join(f"{left_m + x_m:.3f},{low_m + y_m:.3f}" for x_m, y_m in building)}"/>'
+        for replica in range(replicas)
+        for left_m, low_m in [replica_origin(replica, spacing_m)]
+        for number, building in enumerate(scene.buildings)
+    ]
+    return "\n".join(["<additional>", *lines, "</additional>", ""])
+
+
+def _config_xml(scene: Scene) -> str:
+    additional = [DRIVERS_FILE, ROUTES_FILE, *([BUILDINGS_FILE] if scene.buildings else [])]
     return f"""<configuration>
     <input>
         <net-file value="{NET_FILE}"/>
-        <additional-files value="{DRIVERS_FILE},{ROUTES_FILE}"/>
+        <additional-files value="{",".join(additional)}"/>
         <route-files value="saturated.rou.xml"/>
     </input>
     <time>
         <begin value="0"/>
         <end value="300"/>
-        <step-length value="{step_s:g}"/>
+        <step-length value="{scene.step_s:g}"/>
     </time>
     <processing>
         <max-depart-delay value="1"/>

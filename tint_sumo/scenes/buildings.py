@@ -7,7 +7,6 @@ import shapely
 from tint_sumo.scenes.layout import layout
 from tint_sumo.scenes.scene import Building, Scene
 
-BUILDING = "building"  # type of a polygon in SUMO
 _LEAST_M2 = 4.0  # pieces of ground that are smaller are too small for a building
 _ROUNDING_M = 0.05  # outlines have as few points as they can have within this
 

@@ -27,6 +27,7 @@ from tint_sumo.core.ranges import require_ranges
 from tint_sumo.scenes.digest import scene_digest
 from tint_sumo.scenes.network import Network, Point
 
+BUILDING = "building"  # type of its polygon in SUMO
 Building = tuple[Point, ...]  # its corners, in order
 
 
@@ -105,9 +106,7 @@ class Scene:
                 )
         for building in self.buildings:
             if len(building) < 3 or not shapely.Polygon(building).is_valid:
-                raise InputError(
-                    f"a building must have three corners or more, and a simple outline, not {shown(building)}"
-                )
+                raise InputError(f"buildings must have simple outlines of three corners or more, not {shown(building)}")
         if not self.step_s <= self.tau_s < math.inf:  # with less, SUMO's drivers hit each other
             raise InputError(f"tau_s must be at least a step of {self.step_s:g} s, and finite, not {self.tau_s}")
 

@@ -32,9 +32,10 @@ from tint_sumo.core.structures import (
     require_base,
     require_known,
 )
+from tint_sumo.scenes.buildings import corner_buildings
 from tint_sumo.scenes.drivers import PopulationSetting
 from tint_sumo.scenes.registry import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, digest_of, find_scene, find_scenes
-from tint_sumo.scenes.scene import Scene, require_scene_name
+from tint_sumo.scenes.scene import Building, Scene, require_scene_name
 from tint_sumo.scenes.sumocfg import SumocfgScene, from_sumocfg
 
 RouteM = Annotated[float, Range(0.0, 1e6)]
@@ -66,6 +67,9 @@ class SceneSettings:
     """Step of the simulation."""
     time_limit_s: TimeS
     """Longest time of an episode."""
+    buildings: DistanceM | tuple[Building, ...] = ()
+    """What hides vehicles from a sensor with occlusion: outlines, each a list of x and y of its corners; or a number,
+    for a building at each corner of the roads, so many m from them."""
 
     def __post_init__(self) -> None:
         if self.name in SCENES:
@@ -89,6 +93,7 @@ class SceneSettings:
             max_vehicles=scene.max_vehicles,
             step_s=scene.step_s,
             time_limit_s=scene.time_limit_s,
+            buildings=scene.buildings,
         )
 
     def scene(self) -> Scene:
@@ -100,7 +105,7 @@ class SceneSettings:
         return replace(
             base,
             base=base.name,
-            name=self.name or f"{base.name}-{_digest(plain(self))}",
+            name=self.name or f"{base.name}-{_digest(self._named())}",
             ego=ego,
             claim=self.claim,
             population=self.population,
@@ -108,7 +113,12 @@ class SceneSettings:
             max_vehicles=self.max_vehicles,
             step_s=self.step_s,
             time_limit_s=self.time_limit_s,
+            buildings=self.buildings if isinstance(self.buildings, tuple) else corner_buildings(base, self.buildings),
         )
+
+    def _named(self) -> dict[str, Any]:
+        """Return the settings from which a name is made; without buildings it is that of earlier versions."""
+        return {name: value for name, value in plain(self).items() if name != "buildings" or value != []}
 
 
 @dataclass(frozen=True)

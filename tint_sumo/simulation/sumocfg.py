@@ -18,10 +18,9 @@ from traci.exceptions import FatalTraCIError, TraCIException
 
 from tint_sumo.config import NO_LEADER_GAP_M, Backend
 from tint_sumo.core.errors import InputError
-from tint_sumo.scenes.buildings import BUILDING
 from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
-from tint_sumo.scenes.scene import Building, View
+from tint_sumo.scenes.scene import BUILDING, Building, View
 from tint_sumo.scenes.sight import walls_of
 from tint_sumo.scenes.sumocfg import DEFAULT_VTYPE, SumocfgScene, SumoConfig, network_roads
 from tint_sumo.simulation.connection import Connection, connect
@@ -297,6 +296,10 @@ class SumocfgSimulation(Simulation):
         leader, gap_m = np.full(shape, NO_VEHICLE), np.full(shape, np.inf)
         for vehicle_id, slot in self.slot.items():
             ahead_id, ahead_m = leader_of(self.connection, vehicle_id, self._kinds.of(vehicle_id))
+            while ahead_id in self.slot and not known[0, self.slot[ahead_id]] and ahead_m < NO_LEADER_GAP_M:
+                hidden = self._kinds.of(ahead_id)
+                ahead_id, further_m = leader_of(self.connection, ahead_id, hidden)
+                ahead_m += hidden.size_m[0] + further_m
             if ahead_id in self.slot and known[0, self.slot[ahead_id]]:
                 leader[0, slot], gap_m[0, slot] = self.slot[ahead_id], ahead_m
         return leader[replicas], gap_m[replicas]

@@ -124,6 +124,7 @@ def test_observations_are_scaled_and_bounded() -> None:
     np.testing.assert_array_equal(rows["mask"], present.astype(float))
     np.testing.assert_array_equal(rows["traits"], traits)
     np.testing.assert_array_equal(rows["track"], track)
+    np.testing.assert_array_equal(rows["slot"], source)
     np.testing.assert_allclose(rows["time_s"], [0.7, 3.0])
 
 

@@ -13,6 +13,7 @@ from tint_sumo.config import PERFECT, SENSORS, Sensor
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
 from tint_sumo.envs.episodes import Episodes
+from tint_sumo.envs.rendering import pale
 from tint_sumo.envs.rows import SEEN, TRACKS
 from tint_sumo.envs.sensing import Memory, follow_dropouts, follow_noise, show_seen
 from tint_sumo.scenes.geometry import BOX
@@ -265,6 +266,32 @@ def test_copies_and_snapshots_go_on_as_the_original_does() -> None:
             assert one[0][key].tolist() == other[0][key].tolist() == third[0][key].tolist()
         for key in ("track", *TRACKS):
             assert one[4][key].tolist() == other[4][key].tolist() == third[4][key].tolist()
+
+
+def test_pictures_show_range_buildings_and_vehicles_that_are_not_seen() -> None:
+    sensor, border, road = Sensor(occlusion=True, corners_m=1.5, range_m=12.0), (31, 95, 168), "#b9a994"
+    building = tuple(int(road[at : at + 2], 16) for at in (1, 3, 5))
+
+    def count(picture: np.ndarray, colour: tuple[int, ...]) -> int:
+        return int(np.isclose(picture, colour, atol=4).all(axis=2).sum())
+
+    pictures = []
+    for one in (sensor, PERFECT):
+        with closing(SceneEnv(TaskSettings(sensor=one), render_mode="rgb_array")) as env:
+            env.reset(seed=3)
+            picture = env.render()
+            assert picture is not None
+            pictures.append(picture)
+            sensing = env._episodes.sensing
+            hidden = env.simulation.slots.present & ~sensing.seen
+            traits = env.simulation.trait_of_member[env.simulation.slots.member[hidden]]
+            expected = [trait in traits for trait in (0, 1)]
+            pales = [count(picture, pale(colour)) > 500 for colour in env.simulation.scene.trait_colours]
+            assert pales == expected
+            assert hidden.any() == (one == sensor)
+    limited, perfect = pictures
+    assert count(limited, border) > 200 > count(perfect, border)
+    assert count(limited, building) > 20_000 and count(perfect, building) == 0
 
 
 def test_corners_are_for_built_in_scenes_and_delays_are_whole_steps() -> None:

@@ -10,10 +10,11 @@ from gymnasium.wrappers import RecordVideo
 from PIL import Image, ImageColor
 
 from tint_sumo import ENV_IDS
-from tint_sumo.config import STEP_S
+from tint_sumo.config import SENSORS, STEP_S
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Progress
 from tint_sumo.envs import TaskSettings
+from tint_sumo.envs.rendering import BUILDING_COLOUR, pale
 from tint_sumo.films.driving import Driven, Moment, drive_case
 from tint_sumo.films.film import Film, render_case
 from tint_sumo.films.frames import SIZE_PX, Artist
@@ -140,6 +141,23 @@ def test_lamps_claims_and_attention_are_seen() -> None:
     attention = np.where(moment.present, 1.0 / moment.present.sum(), 0.0)
     halos = np.asarray(drawn.frame(replace(moment, attention=attention))) != np.asarray(frame)
     assert halos.any(axis=2)[:370].sum() > 5_000
+
+
+def test_vehicles_that_are_not_seen_are_pale_and_buildings_are_drawn() -> None:
+    task = replace(TASK, sensor=SENSORS["corners"])
+    shown = drive_case(load_policy("vae"), CASE, 0, task).moments
+    drawn = replace(artist("vae"), layout=layout(task.played), sensor=task.sensor)  # type: ignore[arg-type]
+    hidden = next(moment for moment in shown if (moment.present & ~moment.seen & (moment.traits == 0)).any())
+    paled = pale(BLUE)
+    assert count(drawn.frame(hidden), paled) > 300
+    assert count(drawn.frame(replace(hidden, seen=hidden.present)), paled) == 0
+    assert count(drawn.frame(hidden), ImageColor.getrgb(BUILDING_COLOUR)) > 20_000
+    assert count(artist("vae").frame(hidden), ImageColor.getrgb(BUILDING_COLOUR)) == 0
+    for moment in shown:
+        assert moment.attention is not None and not moment.attention[~moment.seen].any()
+        assert not moment.seen[~moment.present].any()
+        np.testing.assert_array_equal(moment.traits >= 0, moment.present)
+    assert any((moment.present & ~moment.seen).any() and moment.attention.any() for moment in shown)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("scene", ENV_IDS)

@@ -101,6 +101,7 @@ def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -
         ego_brakes=True,
         is_held=False,
         present=np.array([number >= 0 for number in vehicles]),
+        seen=np.array([number >= 0 for number in vehicles]),
         vehicles=np.array(vehicles),
         boxes=boxes,
         brakes=np.array([False, True]),

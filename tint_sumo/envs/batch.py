@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from tint_sumo.core.errors import InputError, shown
 from tint_sumo.envs.episodes import Episodes, TaskSettings
-from tint_sumo.envs.rendering import render_scene
 from tint_sumo.envs.rows import Rows, outcome_name
 from tint_sumo.simulation.timing import StepPart, does
 
@@ -166,8 +165,7 @@ class LocalBatch:
         return Ended(index, self.rows[index].copy(), self.episodes.collision_info(index))
 
     def render(self) -> list[NDArray[np.uint8]]:
-        simulation = self.episodes.simulation
-        return [render_scene(simulation, index) for index in range(simulation.replicas)]
+        return [self.episodes.render(index) for index in range(len(self.rows))]
 
     def close(self) -> None:
         self.episodes.simulation.close()

@@ -25,6 +25,7 @@ from tint_sumo.config import (
 )
 from tint_sumo.core.errors import InputError, find_named, shown
 from tint_sumo.core.ranges import require_ranges
+from tint_sumo.envs.rendering import render_scene
 from tint_sumo.envs.rows import (
     BOUND,
     COLLISION,
@@ -292,6 +293,10 @@ class Episodes:
             sensing.noise_m[envs],
             self.rows[envs],
         )
+
+    def render(self, index: int) -> NDArray[np.uint8]:
+        """Draw an environment as an (H, W, 3) image, with what its sensor perceives."""
+        return render_scene(self.simulation, index, self.settings.sensor, self.sensing.seen[index])
 
     def collision_info(self, index: int) -> dict[str, Any]:
         """Return the other driver and the site of a collision; empty if the episode has not ended with a collision."""

@@ -6,11 +6,12 @@ from functools import lru_cache
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import Image, ImageColor, ImageDraw
 
+from tint_sumo.config import PERFECT, Sensor
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import View
-from tint_sumo.scenes.geometry import Floats
+from tint_sumo.scenes.geometry import Bools, Floats
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.simulation import Simulation
 
@@ -18,6 +19,10 @@ RENDER_FPS = 10
 _WIDTH = 736  # pixels
 _OVERSAMPLING = 3  # the image is drawn larger and scaled down, for smooth edges
 _GRASS, _ROAD, _LINE, _EGO, _GLASS = "#e9efe3", "#8f959b", "#ffffff", (240, 180, 0), "#2b2f33"
+
+BUILDING_COLOUR, _SIGHT = "#b9a994", "#1f5fa8"
+_PALENESS = 0.65  # part of the road's colour in that of a vehicle that is not seen
+_FAR_M = 1000.0  # beyond every picture
 
 
 def render_fps(decision_s: float | None) -> float:
@@ -30,16 +35,35 @@ def require_render_mode(render_mode: str | None, choices: Sequence[str]) -> None
         raise InputError(f"unknown render_mode {render_mode!r}; choose one of None, {', '.join(map(repr, choices))}")
 
 
-def render_scene(simulation: Simulation, replica: int) -> NDArray[np.uint8]:
-    """Draw one replica as an (H, W, 3) image."""
+def render_scene(
+    simulation: Simulation, replica: int, sensor: Sensor = PERFECT, seen: Bools | None = None
+) -> NDArray[np.uint8]:
+    """Draw one replica as an (H, W, 3) image.
+
+    Args:
+        simulation: all replicas.
+        replica: its number.
+        sensor: its range and field of view are drawn.
+        seen: (V,) which vehicles the ego perceives; the others are pale. All of them if not given.
+    """
     view, colours = simulation.view(replica), simulation.scene.trait_colours
     canvas = Canvas(view, background(simulation.roads, view.moved(*simulation.origin_m)).copy())
-    slots = simulation.slots
+    for building in simulation.buildings:
+        canvas.fill(shapely.Polygon(building), BUILDING_COLOUR)
+    slots, ego = simulation.slots, simulation.egos.box[replica]
     for slot in np.flatnonzero(slots.present[replica]).tolist():
         colour = colours[simulation.trait_of_member[slots.member[replica, slot]]]
-        canvas.vehicle(slots.box[replica, slot], colour)
-    canvas.vehicle(simulation.egos.box[replica], _EGO)
+        is_seen = seen is None or bool(seen[slot])
+        canvas.vehicle(slots.box[replica, slot], colour if is_seen else pale(colour), with_glass=is_seen)
+    canvas.vehicle(ego, _EGO)
+    canvas.sight(sensor, ego)
     return canvas.image()
+
+
+def pale(colour: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the colour of a vehicle that the ego does not perceive."""
+    road = ImageColor.getrgb(_ROAD)
+    return tuple(round(_PALENESS * grey + (1.0 - _PALENESS) * part) for grey, part in zip(road, colour, strict=True))
 
 
 @lru_cache(maxsize=8)  # a scene's view stays as it is, while one around the ego moves on
@@ -85,12 +109,27 @@ class Canvas:
             for hole in part.interiors:
                 self.draw.polygon(self.pixels(shapely.get_coordinates(hole)), fill=_GRASS)
 
-    def vehicle(self, box: np.void, colour: tuple[int, ...]) -> None:
+    def vehicle(self, box: np.void, colour: tuple[int, ...], *, with_glass: bool = True) -> None:
         """Draw a vehicle's box, with its windscreen towards the front."""
         length_m, half_width_m = box["length_m"], box["width_m"] / 2
         self.draw.polygon(self.part(box, (-length_m / 2, length_m / 2), (-half_width_m, half_width_m)), fill=colour)
+        if not with_glass:
+            return
         half_glass_m = 0.8 * half_width_m
         self.draw.polygon(self.part(box, (0.16 * length_m, 0.3 * length_m), (-half_glass_m, half_glass_m)), fill=_GLASS)
+
+    def sight(self, sensor: Sensor, ego: np.void) -> None:
+        """Draw the border of an ego's range and field of view, if there are any."""
+        all_around = sensor.field_of_view_deg >= 360.0
+        if sensor.range_m is None and all_around:
+            return
+        facing, half_rad = np.arctan2(ego["heading_y"], ego["heading_x"]), np.radians(sensor.field_of_view_deg / 2)
+        angles = np.linspace(facing - half_rad, facing + half_rad, 181)
+        centre = np.array([[ego["x_m"], ego["y_m"]]])
+        range_m = _FAR_M if sensor.range_m is None else sensor.range_m
+        border = centre + range_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        points = border if all_around else np.concatenate([centre, border, centre])
+        self.draw.line(self.pixels(points), fill=_SIGHT, width=2 * self._oversampling)
 
     def part(
         self, box: np.void, along_m: tuple[float, float], across_m: tuple[float, float]

@@ -17,8 +17,8 @@ from tint_sumo.scenes.sumocfg import SumocfgScene
 Observation = dict[str, NDArray[np.float32]]
 OBSERVATION_KEYS = ("ego", "vehicles", "mask")
 TRACKS = ("position_m", "gap_m", "passed")  # per vehicle slot, if they are asked for
-SEEN = ("vehicles", "mask", "traits", "track", *TRACKS)  # what the sensor says of the vehicles, and their traits
-TRUTH = ("track", "true_mask", "true_vehicles", "true_traits")  # per vehicle slot, if the sensor is not perfect
+SEEN = ("vehicles", "mask", "traits", "track", "slot", *TRACKS)  # what the sensor says, and true traits that fit it
+TRUTH = ("track", "slot", "true_mask", "true_vehicles", "true_traits")  # per vehicle slot, if the sensor is not perfect
 REWARD_TERMS = ("goal", "collision", "speed", "step")
 Outcome = Literal["success", "timeout", "collision"]
 OUTCOMES: tuple[str, ...] = get_args(Outcome)
@@ -38,6 +38,7 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
             ("mask", np.float32, slots),
             ("traits", np.int8, slots),  # number of the driver's profile, or NO_VEHICLE
             ("track", np.int64, slots),  # number of the track in the episode, or NO_VEHICLE
+            ("slot", np.int64, slots),  # the simulation's slot of the vehicle that is shown, or NO_VEHICLE
             ("position_m", np.float64, slots),  # along the route, as observed; 0 in empty slots
             ("gap_m", np.float64, slots),  # gap to the leader, as observed; infinite without one
             ("passed", np.int8, slots),  # 1 where the ego has left the vehicle's route behind
@@ -218,6 +219,7 @@ def observe(
             row.mask[slot] = 1.0 if there else 0.0
             row.traits[slot] = traits[index, shown] if there else -1
             row.track[slot] = track[index, slot]
+            row.slot[slot] = shown
 
 
 @compiled
@@ -299,6 +301,7 @@ def show_earlier(rows: Rows, frames: Rows, steps: Numbers) -> None:
             row.mask[slot] = earlier.mask[slot]
             row.traits[slot] = earlier.traits[slot]
             row.track[slot] = earlier.track[slot]
+            row.slot[slot] = earlier.slot[slot]
             row.position_m[slot] = earlier.position_m[slot]
             row.gap_m[slot] = earlier.gap_m[slot]
             row.passed[slot] = earlier.passed[slot]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tint_sumo.envs.batch import Snapshot, checked_snapshots
 from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_options, checked_seed
 from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space
-from tint_sumo.envs.rendering import RENDER_FPS, render_fps, render_scene, require_render_mode
+from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, Observation, fields_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
 from tint_sumo.simulation import Simulation
@@ -73,7 +73,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `position_m`   | with `tracks`: `(V,)` where each vehicle's front is seen on its route; 0 in empty slots     |
     | `gap_m`        | with `tracks`: `(V,)` the gap that is seen to the next vehicle ahead; infinite without one  |
     | `passed`       | with `tracks`: `(V,)` int8, 1 where the ego has left the vehicle's route behind             |
-    | `track`        | with a sensor: `(V,)` number of the slot's track in the episode; -1 in empty slots          |
+    | `track`,       | with a sensor: `(V,)` number of the track in the episode that the slot shows, and of the    |
+    | `slot`         | simulation's slot with its vehicle; -1 in empty slots                                       |
     | `true_mask`,   | with a sensor: `(V,)` and `(V, 2)`, the simulation's slots as they are, seen or not, with   |
     | `true_vehicles`| their traits in `true_traits`: not to be used by policies                                   |
     | `outcome`      | `"success"`, `"collision"`, `"timeout"`, or `""` while the episode goes on                  |
@@ -254,14 +255,16 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     def render(self) -> NDArray[np.uint8] | None:
         """Return an (H, W, 3) image of the scene; conservative drivers blue, aggressive red, the ego yellow.
 
+        Vehicles that the ego's sensor does not perceive are pale, and its range and field of view have a blue border.
+
         None with ``render_mode="human"``, where the window follows by itself.
         """
         self._calls.require_episode()
-        return render_scene(self._episodes.simulation, 0) if self.render_mode == "rgb_array" else None
+        return self._episodes.render(0) if self.render_mode == "rgb_array" else None
 
     def _show(self) -> None:
         if self._window:
-            self._window.show(render_scene(self._episodes.simulation, 0))
+            self._window.show(self._episodes.render(0))
 
     def close(self) -> None:
         """End the simulation; safe to call twice. Everything else is refused from then on."""

@@ -16,7 +16,7 @@ from tint_sumo.methods.loading import Contender
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.trait_sources import Observation, OracleTraits, one_hot
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
-from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers
+from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers
 from tint_sumo.simulation.scene import SceneSimulation
 
 _BRAKING_MPS2 = 0.5  # vehicles that slow down by more than this show it
@@ -31,7 +31,8 @@ class Moment:
     ego_mps: float
     ego_brakes: bool
     is_held: bool  # the ego's safety check overrides the policy
-    present: Bools  # (V,)
+    present: Bools  # (V,) of the simulation's slots, as all (V,)
+    seen: Bools  # (V,) which of them the ego perceives
     vehicles: Numbers  # (V,) running numbers of the vehicles in the episode, -1 in empty slots
     boxes: Boxes  # (V,)
     brakes: Bools  # (V,)
@@ -78,6 +79,7 @@ class _Recorder:
     def __init__(self, contender: Contender) -> None:
         self._policy = contender.policy
         inner: Any = getattr(contender.policy, "policy", contender.policy)  # a Stable-Baselines3 model holds its policy
+        self._observed: NDArray[np.int8] = np.zeros(0, np.int8)  # true traits of the observation's slots
         self._network = inner if isinstance(inner, GruPolicy) else None
         self._desired_mps: float | None = None
         self._value: float | None = None
@@ -90,6 +92,7 @@ class _Recorder:
         simulation = base.env.batch.episodes.simulation
         assert isinstance(simulation, SceneSimulation)  # films show built-in scenes
         self._simulation = simulation
+        self._episodes = base.env.batch.episodes
         self._speeds = _Speeds(simulation)
 
     def predict(
@@ -114,7 +117,7 @@ class _Recorder:
     ) -> float:
         seen = dict(observation)
         if network.critic_extractor is not None:
-            seen[TRUE_TRAITS] = one_hot(self.moments[-1].traits[None], OracleTraits().size)
+            seen[TRUE_TRAITS] = one_hot(self._observed[None], OracleTraits().size)
         tensors, _ = network.obs_to_tensor(seen)
         device = network.device
         states = network.initial_states(1) if state is None else torch.as_tensor(state[0], device=device)
@@ -128,6 +131,8 @@ class _Recorder:
         egos, slots = simulation.egos, simulation.slots
         brakes, ego_brakes = self._speeds.brakes()
         attention = None if self._network is None else self._network.attention_weights(observation)[0]
+        self._observed = info["traits"]
+        of_member = np.append(simulation.trait_of_member, NO_VEHICLE)
         self.moments.append(
             Moment(
                 time_s=len(self.moments) * simulation.scene.step_s,
@@ -136,18 +141,26 @@ class _Recorder:
                 ego_brakes=ego_brakes,
                 is_held=bool(egos.unsafe[0]),
                 present=slots.present[0].copy(),
+                seen=self._episodes.sensing.seen[0].copy(),
                 vehicles=slots.vehicle_number[0].copy(),
                 boxes=slots.box[0].copy(),
                 brakes=brakes,
-                traits=info["traits"].astype(np.int64),
-                observed_traits=observation[TRAITS][0].astype(np.float64) if TRAITS in observation else None,
-                attention=None if attention is None else attention.astype(np.float64),
+                traits=of_member[slots.member[0]],
+                observed_traits=self._by_vehicle(observation[TRAITS][0]) if TRAITS in observation else None,
+                attention=None if attention is None else self._by_vehicle(attention),
                 claimed=simulation.yielding.has_claimed[0].copy(),
                 desired_mps=self._desired_mps,
                 value=self._value,
                 outcome=info.get("outcome", ""),  # the info of a reset has none
             )
         )
+
+    def _by_vehicle(self, observed: NDArray[np.floating]) -> Floats:
+        """Return values of the observation's slots (V, ...) in the simulation's slots, 0 where none belongs."""
+        slot = self._episodes.rows["slot"][0]
+        placed = np.zeros(observed.shape)
+        placed[slot[slot >= 0]] = observed[slot >= 0]
+        return placed
 
 
 class _Speeds:

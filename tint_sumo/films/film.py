@@ -68,13 +68,14 @@ def render_case(
     if not 0 <= case < CASES_PER_SET:
         raise InputError(f"case must lie in 0 to {CASES_PER_SET - 1}, not {case}")
     task = task or contender.task
-    played = require_film_scene(task.scene)
+    played = require_film_scene(task.played)
     driven = drive_case(contender, case, case_set, task)
     shown = _spread(driven.moments) if out.suffix.lower() == ".png" else driven.moments
     parts = (Path(contender.name).name, played.name, f"case {case} of set {case_set}", _words(task.p_conservative))
     has_attention = driven.moments[0].attention is not None
     colour = ImageColor.getrgb(look_of(contender.method).colour)
-    artist = Artist(layout(played), (" " * 5).join(parts), colour, fit_reader(contender), has_attention)
+    reader = fit_reader(contender)
+    artist = Artist(layout(played), (" " * 5).join(parts), colour, reader, has_attention, task.sensor)
     with whole_file(out) as partial:
         _WRITERS[out.suffix.lower()](partial, artist, shown, report)
     return Film(driven.case.outcome, driven.case.time_s, len(shown))

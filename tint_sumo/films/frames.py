@@ -7,7 +7,8 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw, ImageFont
 
-from tint_sumo.envs.rendering import Canvas, background
+from tint_sumo.config import PERFECT, Sensor
+from tint_sumo.envs.rendering import BUILDING_COLOUR, Canvas, background, pale
 from tint_sumo.films.driving import Moment
 from tint_sumo.films.trait_probe import TraitReader
 from tint_sumo.scenes import View
@@ -39,6 +40,7 @@ class Artist:
     colour: Colour  # of the method, as in all figures
     reader: TraitReader | None  # None without traits in the observation
     has_attention: bool
+    sensor: Sensor = PERFECT
 
     def frame(self, moment: Moment) -> Image.Image:
         """Return an RGB image of ``SIZE_PX``."""
@@ -60,9 +62,13 @@ class Artist:
         fills = self._fills(moment)
         for slot in slots:
             profile = self.layout.scene.population.profiles[moment.traits[slot]]
-            outline = tuple(int(part) for part in profile.colour.split(","))
-            self._draw_vehicle(canvas, moment.boxes[slot], outline, fills[slot], bool(moment.brakes[slot]))
+            outline = _parts(profile.colour)
+            if moment.seen[slot]:
+                self._draw_vehicle(canvas, moment.boxes[slot], outline, fills[slot], bool(moment.brakes[slot]))
+            else:
+                canvas.vehicle(moment.boxes[slot], pale(outline), with_glass=False)
         self._draw_vehicle(canvas, moment.ego, _INK, _EGO, moment.ego_brakes)
+        canvas.sight(self.sensor, moment.ego)
         return canvas.drawing.reduce(_OVERSAMPLING)
 
     def _fills(self, moment: Moment) -> list[Colour]:
@@ -112,12 +118,19 @@ class Artist:
         below = top + 22
         if self.reader is None:
             draw.text((10, below), "this policy has no traits of the others", font=_font(13), fill=_FAINT)
+            self._add_hidden(draw, (280, below))
             return image
         left = _key(draw, (10, below), f"inferred trait: {first.name}", fill=_parts(first.colour))
         left = _key(draw, (left, below), second.name, fill=_parts(second.colour))
         left = _key(draw, (left, below), "unsure", fill=_UNSURE)
-        _key(draw, (left, below), "nothing inferred", outline=_FAINT, fill=_WHITE)
+        left = _key(draw, (left, below), "nothing inferred", outline=_FAINT, fill=_WHITE)
+        self._add_hidden(draw, (left, below))
         return image
+
+    def _add_hidden(self, draw: ImageDraw.ImageDraw, at: tuple[int, int]) -> None:
+        """Add vehicles that are not seen to the legend, if there can be any."""
+        if self.sensor.hides:
+            _key(draw, at, "not seen", fill=pale(_parts(self.layout.scene.population.profiles[0].colour)))
 
 
 def _wanted(moment: Moment) -> str:
@@ -203,6 +216,8 @@ def _roads(layout: Layout) -> Image.Image:
     """Return the empty roads with the ego's way; not to be drawn on."""
     roads = background(layout.roads, _view(layout), SIZE_PX[0], _OVERSAMPLING).copy()
     canvas = Canvas(_view(layout), roads, width_px=SIZE_PX[0], oversampling=_OVERSAMPLING)
+    for building in layout.scene.buildings:
+        canvas.fill(shapely.Polygon(building), BUILDING_COLOUR)
     task = layout.scene.ego
     way = _between(layout.ego.way, task.start_m, task.goal_m)
     canvas.draw.line(canvas.pixels(way), fill=_WAY, width=3 * _OVERSAMPLING, joint="curve")

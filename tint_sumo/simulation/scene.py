@@ -16,7 +16,6 @@ from tint_sumo.scenes.geometry import Bools, Floats, Numbers, place
 from tint_sumo.scenes.layout import layout
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import Scene, View
-from tint_sumo.scenes.sight import walls_of
 from tint_sumo.simulation.demand import Demand, PlacedVehicle
 from tint_sumo.simulation.lanes import LanePositions
 from tint_sumo.simulation.simulation import Simulation
@@ -50,7 +49,7 @@ class SceneSimulation(Simulation):
         profiles = scene.population.profiles
         self.trait_of_member = np.array([profiles.index(member.profile) for member in self.population])
         self.passed_m = self.layout.zones.passed_m
-        self.walls = walls_of(scene.buildings)
+        self._build(scene.buildings)
         self._with_ego = with_ego
         self.link = SumoLink(self.layout, replicas, backend, collision_options)
         self.connection = self.link.connection

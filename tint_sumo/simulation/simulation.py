@@ -1,10 +1,14 @@
 """The interface of all simulations, and the parts that they share."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
+
+import numpy as np
 
 from tint_sumo.scenes.geometry import Bools, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
-from tint_sumo.scenes.scene import Scene, View
+from tint_sumo.scenes.scene import Building, Scene, View
+from tint_sumo.scenes.sight import walls_of
 from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation.connection import Connection
 from tint_sumo.simulation.ego import Collision, Egos
@@ -22,7 +26,8 @@ class Simulation(ABC):
     connection: Connection
     trait_of_member: Numbers  # number of the trait of each member of the population
     passed_m: Floats  # (K,) front of an ego that has left each route of the traffic behind
-    walls: Floats  # (W, 4) of buildings, as ``tint_sumo.scenes.sight.walls_of`` returns them
+    buildings: tuple[Building, ...] = ()  # in the scene's frame
+    walls: Floats = np.zeros((0, 4))  # theirs, as ``tint_sumo.scenes.sight.walls_of`` returns them
     origin_m = (0.0, 0.0)  # position of the scene's origin in the network
 
     def __init__(self, replicas: int, scene: Scene | SumocfgScene) -> None:
@@ -30,6 +35,11 @@ class Simulation(ABC):
         self.replicas = replicas
         self.slots = Slots(replicas, scene.max_vehicles)
         self.egos = Egos(replicas, scene)
+
+    def _build(self, buildings: Iterable[Building]) -> None:
+        """Take over the buildings, which may differ between episodes."""
+        self.buildings = tuple(buildings)
+        self.walls = walls_of(self.buildings)
 
     @property
     def backend(self) -> str:

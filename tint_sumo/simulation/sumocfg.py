@@ -21,7 +21,6 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import BUILDING, Building, View
-from tint_sumo.scenes.sight import walls_of
 from tint_sumo.scenes.sumocfg import DEFAULT_VTYPE, SumocfgScene, SumoConfig, network_roads
 from tint_sumo.simulation.connection import Connection, connect
 from tint_sumo.simulation.simulation import Simulation
@@ -136,7 +135,6 @@ class SumocfgSimulation(Simulation):
         super().__init__(replicas, scene)
         self.trait_of_member = np.arange(len(scene.vtypes))
         self.passed_m = np.array([np.inf])  # no vehicle's way is ever left behind
-        self.walls = walls_of(())
         with refusals(scene.config):
             self.connection = connect(sumo_options(scene.config, seed=0), backend)
         self.warm_starts = WarmStarts(scene, self.connection, partial(sumo_options, scene.config))
@@ -176,15 +174,16 @@ class SumocfgSimulation(Simulation):
         ego = self.egos.box[0]
         _write_box(ego, sight, (0.0, 0.0))
         self.origin_m = (float(ego["x_m"]), float(ego["y_m"]))
-        self.walls = walls_of(self._buildings()) - np.tile(self.origin_m, 2)
+        self._build(self._find_buildings())
         self._look()
 
-    def _buildings(self) -> Iterator[Building]:
+    def _find_buildings(self) -> Iterator[Building]:
         """Yield the polygons of the configuration's additional files whose type is building, or begins with it."""
+        left_m, low_m = self.origin_m
         polygons = self.connection.polygon
         for polygon in polygons.getIDList():
             if polygons.getType(polygon).startswith(BUILDING):
-                yield tuple(polygons.getShape(polygon))
+                yield tuple((x_m - left_m, y_m - low_m) for x_m, y_m, *_ in polygons.getShape(polygon))
 
     def clear(self, replica: int) -> None:
         self._drives = False

@@ -13,6 +13,7 @@ from tint_sumo.core.files import PICTURE_SUFFIXES, RUN_FILE, write_json, write_t
 # A call of each command that writes files; it must not touch OUT.
 WRITING = {
     "net": "net --out OUT",
+    "scene check": "scene check DATA --figure OUT",
     "record": "record --windows 20 --out OUT",
     "dataset inspect": "dataset inspect DATA --figure OUT",
     "tracks inspect": "tracks inspect DATA --figure OUT",

@@ -21,6 +21,7 @@ from tint_sumo.cli.models import Models
 from tint_sumo.cli.net import Net
 from tint_sumo.cli.policy import Policy
 from tint_sumo.cli.render import Render
+from tint_sumo.cli.scene import Scene
 from tint_sumo.cli.study import Study
 from tint_sumo.cli.tracks import Tracks
 from tint_sumo.cli.traits import Traits
@@ -47,6 +48,7 @@ class TintSumo:
 
     command: (
         Annotated[Net, subcommand("net")]
+        | Annotated[Scene, subcommand("scene")]
         | Annotated[Record, subcommand("record")]
         | Annotated[Dataset, subcommand("dataset")]
         | Annotated[Tracks, subcommand("tracks")]

@@ -1,5 +1,6 @@
 """Types of flags with their help. A scene, a population or a budget is a name, or defined in a configuration file."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +21,11 @@ def optional(metavar: str, text: str, default: str = "none") -> Any:
 Cases = Annotated[int, Range(1, 1_000_000)]
 MixFlag = Many[Fraction]  # one probability, or the two ends of a range
 SCENES = ", ".join(ENV_IDS)
+
+
+def edges_of(words: Sequence[str]) -> tuple[str, ...]:
+    """Return the edges of a route, given in words, or between commas, as ids that begin with a dash must be."""
+    return tuple(edge for word in words for edge in word.split(",") if edge)
 
 
 def _read_scene(value: Any, where: Where = ()) -> Any:

@@ -14,7 +14,7 @@ from tint_sumo.dataset.fcd import EPISODE_PERIOD_S
 from tint_sumo.dataset.fcd_reader import are_parked, read_fcd
 from tint_sumo.dataset.schema import TRAJECTORIES, read_shard, read_shard_metadata
 from tint_sumo.scenes.sumocfg import read_net
-from tint_sumo.simulation.vtypes import read_sizes, size_of
+from tint_sumo.simulation.vtypes import find_vtype, read_vtype_table
 
 MAX_STEP_S = 1.0  # a straight line between farther points would be no driving any more
 _POS_DIGIT_M = 0.01  # SUMO's default precision
@@ -68,7 +68,7 @@ def gaps_m(rows: pd.DataFrame, length_m: NDArray[np.float64], lanes: Lanes | Non
     begin so near that the gap can be less than ``NO_LEADER_GAP_M``.
 
     Args:
-        rows: columns time_s, lane and pos_m as ``tint_sumo.dataset.fcd.read_fcd`` gives them.
+        rows: columns time_s, lane and pos_m as ``tint_sumo.dataset.fcd_reader.read_fcd`` gives them.
         length_m: of each row's vehicle, (M,).
         lanes: of the network.
 
@@ -150,9 +150,16 @@ def _lengths_m(rows: pd.DataFrame, vtypes_file: Path, source: Path) -> NDArray[n
     """Return the length of each row's vehicle, (M,), by its vType."""
     if "vehicle_class" not in rows:
         raise InputError(f"{source} lacks the vehicles' types; run SUMO without --fcd-output.attributes")
-    sizes, vtypes = read_sizes(vtypes_file), rows["vehicle_class"].cat
-    length_m = np.array([size_of(vtype, sizes, vtypes_file).length_m for vtype in vtypes.categories])
-    return np.asarray(length_m[vtypes.codes])
+    known, vtypes = read_vtype_table(vtypes_file), rows["vehicle_class"].cat
+    lengths_m = []
+    for name in vtypes.categories:
+        vtype = find_vtype(name, known)
+        if vtype is None:
+            raise InputError(
+                f"{vtypes_file} has no vType {name!r}, which vehicles of {source} have; give the file that has"
+            )
+        lengths_m.append(vtype.length_m)
+    return np.array(lengths_m)[vtypes.codes]
 
 
 def _trajectories_in(source: Path) -> Path | None:

@@ -29,7 +29,7 @@ from tint_sumo.scenes.scene import EgoTask
 
 NET_VERSION = (1, 20)  # the version that this SUMO's netconvert writes into networks
 DEFAULT_VTYPE = "DEFAULT_VEHTYPE"  # SUMO's type for vehicles that name none
-_EGO_CLASS = "passenger"
+EGO_CLASS = "passenger"
 _COLOURS = ((40, 90, 200), (200, 40, 40), (30, 140, 70), (130, 60, 170), (220, 110, 20), (20, 150, 170), (90, 90, 90))
 _SEAM_M = 0.06  # half of the line between two lanes
 _DEFAULT_STEP_S = 1.0  # SUMO's
@@ -182,7 +182,7 @@ def from_sumocfg(
     """
     config = read_config(Path(sumocfg))
     net = read_net(config.net_file)
-    edge_start_m, spans_m, length_m = _measured(net, tuple(ego_route))
+    edge_start_m, spans_m, length_m = measure_route(net, tuple(ego_route))
     if not 0.0 <= start_m < goal_m <= length_m:
         raise InputError(
             f"the ego's start ({start_m:g} m) and goal ({goal_m:g} m) must lie on its route one behind the other, "
@@ -323,14 +323,18 @@ def network_roads(net_file: Path) -> Roads:
     return Roads(shapely.STRtree(paved_areas(net, seam_m=_SEAM_M, gap_m=_SEAM_M)), shapely.STRtree([]))
 
 
-def _measured(net: Any, edges: tuple[str, ...]) -> tuple[tuple[float, ...], list[tuple[float, float]], float]:
-    """Return the starts of a route's edges, their spans, and the route's length, in m along the route."""
+def measure_route(net: Any, edges: tuple[str, ...]) -> tuple[tuple[float, ...], list[tuple[float, float]], float]:
+    """Return the starts of a route's edges, their spans, and the route's length, in m along the route.
+
+    Raises:
+        InputError: the network lacks an edge, an edge is closed to passenger cars, or they are not connected.
+    """
     if not edges:
         raise InputError("ego_route is empty; give the edges that the ego drives along")
     unknown = [edge for edge in edges if not net.hasEdge(edge)]
     if unknown:
         raise InputError(f"ego_route: the network has no edge {unknown[0]!r}")
-    closed = [edge for edge in edges if not net.getEdge(edge).allows(_EGO_CLASS)]
+    closed = [edge for edge in edges if not net.getEdge(edge).allows(EGO_CLASS)]
     if closed:
         raise InputError(f"ego_route: edge {closed[0]!r} is closed to passenger cars")
     lengths_m = [float(net.getEdge(edge).getLength()) for edge in edges]
@@ -346,7 +350,7 @@ def _junction_m(net: Any, edge: str, after: str) -> float:
     ways = [
         way
         for way in net.getEdge(edge).getOutgoing().get(net.getEdge(after), [])
-        if way.getFromLane().allows(_EGO_CLASS) and way.getToLane().allows(_EGO_CLASS)
+        if way.getFromLane().allows(EGO_CLASS) and way.getToLane().allows(EGO_CLASS)
     ]
     if not ways:
         raise InputError(f"ego_route: no way for passenger cars leads from edge {edge!r} to edge {after!r}")

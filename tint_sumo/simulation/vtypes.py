@@ -1,4 +1,4 @@
-"""Sizes of vTypes, as SUMO knows them: floating-car data name a vehicle's type, and not its size."""
+"""The vTypes of route and additional files, as SUMO knows them: floating-car data name a vehicle's type alone."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,31 +18,38 @@ from tint_sumo.core.reading import TABLE_BYTES, require_file
 from tint_sumo.scenes.sumocfg import read_config
 from tint_sumo.simulation.connection import connect
 
-_SIZES = ("id", "vClass", "length", "width")  # attributes of a vType that its size follows from
+_ATTRIBUTES = ("id", "vClass", "length", "width")  # of a vType: its size follows from them
+_MODEL, _USUAL_MODEL = "carFollowModel", "Krauss"  # SUMO does not say which model a type has
 _DEFINED_FOR_ONE = "@"  # SUMO calls the type of a vehicle that has values of its own TYPE@VEHICLE
 
 
 @dataclass(frozen=True)
-class Size:
-    """Size of the vehicles of a vType."""
+class VType:
+    """Size and kind of the vehicles of a vType."""
 
     length_m: float
     width_m: float
+    vehicle_class: str
+    car_following: str  # model
 
 
-def read_sizes(file: Path) -> Mapping[str, Size]:
-    """Return the sizes of all vTypes in a route or additional file, or in those of a .sumocfg, and of SUMO's defaults.
+def read_vtype_table(file: Path) -> Mapping[str, VType]:
+    """Return the vTypes of a route or additional file, or of those of a .sumocfg, and SUMO's defaults, by their ids.
 
-    SUMO is asked for them, since sizes that a vType does not have follow from its vClass.
+    SUMO is asked for sizes, since those that a vType does not have follow from its vClass.
 
     Raises:
         InputError: there is no such file, it is damaged, or SUMO refuses a vType.
     """
     files = read_config(file).demand_files if file.suffix == ".sumocfg" else (file,)
-    elements = {identity: element for found in files for identity, element in _elements(found).items()}
+    defined = {vtype["id"]: vtype for found in files for vtype in _defined(found)}
+    elements = [
+        f"<vType {' '.join(f'{name}={quoteattr(vtype[name])}' for name in _ATTRIBUTES if name in vtype)}/>"
+        for vtype in defined.values()
+    ]
     with TemporaryDirectory(prefix="tint_sumo_") as folder:
         additional = Path(folder) / "vtypes.add.xml"
-        additional.write_text(f"<additional>{''.join(elements.values())}</additional>", encoding="utf-8")
+        additional.write_text(f"<additional>{''.join(elements)}</additional>", encoding="utf-8")
         options = ["--net-file", str(shipped("sumo_net") / "tint.net.xml"), "--additional-files", str(additional)]
         try:
             connection = connect([*options, "--no-step-log", "true", "--no-warnings", "true"])
@@ -50,38 +57,34 @@ def read_sizes(file: Path) -> Mapping[str, Size]:
             raise InputError(f"SUMO refuses a vType of {file} ({' '.join(str(error).split())}); correct it") from None
         try:
             types = connection.vehicletype
-            return {name: Size(types.getLength(name), types.getWidth(name)) for name in types.getIDList()}
+            return {
+                name: VType(
+                    types.getLength(name),
+                    types.getWidth(name),
+                    types.getVehicleClass(name),
+                    defined.get(name, {}).get(_MODEL, _USUAL_MODEL),
+                )
+                for name in types.getIDList()
+            }
         finally:
             connection.close()
 
 
-def size_of(vtype: str, sizes: Mapping[str, Size], file: Path) -> Size:
-    """Return the size of a vType, of which ``file`` has the sizes.
-
-    Raises:
-        InputError: it is not among them.
-    """
-    found = sizes.get(vtype) or sizes.get(vtype.partition(_DEFINED_FOR_ONE)[0])
-    if found is None:
-        raise InputError(f"{file} has no vType {vtype!r}, which vehicles of the data have; give the file that has it")
-    return found
+def find_vtype(name: str, vtypes: Mapping[str, VType]) -> VType | None:
+    """Return the vType with this id, or the one that a single vehicle's type was made of."""
+    return vtypes.get(name) or vtypes.get(name.partition(_DEFINED_FOR_ONE)[0])
 
 
-def _elements(file: Path) -> dict[str, str]:
-    """Return the vTypes of a file by their ids, as XML with what their sizes follow from."""
+def _defined(file: Path) -> list[dict[str, str]]:
+    """Return the attributes of the vTypes that a file defines."""
     require_file(file, "vTypes", TABLE_BYTES)
     try:
         found = [
-            {name: vtype.getAttribute(name) for name in _SIZES if vtype.hasAttribute(name)}
+            {name: vtype.getAttribute(name) for name in (*_ATTRIBUTES, _MODEL) if vtype.hasAttribute(name)}
             for vtype in sumolib.xml.parse(str(file), "vType")
         ]
     except (SAXException, SyntaxError, ValueError, OSError, EOFError) as error:  # ElementTree's is a SyntaxError
-        raise InputError(
-            f"{file} is damaged ({error}); give a route or additional file of SUMO, or a .sumocfg"
-        ) from None
+        raise InputError(f"{file} is damaged ({error}); give a route file, additional file or .sumocfg") from None
     if any("id" not in vtype for vtype in found):
         raise InputError(f"{file} has a vType without an id; add it")
-    return {
-        vtype["id"]: f"<vType {' '.join(f'{name}={quoteattr(value)}' for name, value in vtype.items())}/>"
-        for vtype in found
-    }
+    return found

@@ -9,6 +9,7 @@ shipped policies and from the tables in data/results. The commands it runs are t
 
 import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ from tint_sumo import ENV_IDS
 from tint_sumo.cli import main as tint_sumo
 from tint_sumo.comparisons.traits import TraitStudy
 from tint_sumo.comparisons.traits_report import plot_noise
+from tint_sumo.config import SENSORS, Sensor
 from tint_sumo.core.files import write_json
-from tint_sumo.envs import SceneEnv
+from tint_sumo.envs import SceneEnv, TaskSettings
 from tint_sumo.methods.registry import Learned, find_method, needed_encoders
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
@@ -123,14 +125,41 @@ def make_pictures(images: Path) -> None:
     """Draw the paper's scene, and all scenes side by side, each with its name."""
     pictures = {name: picture_of(name) for name in ENV_IDS}
     Image.fromarray(pictures[T_INTERSECTION]).save(images / "scene.png", optimize=True)
+    sheet_of(pictures, 3).save(images / "scenes.png", optimize=True)
+
+
+def make_sensor_pictures(images: Path) -> None:
+    """Draw the same moment as different sensors perceive it, each with its name."""
+    wide = Sensor(range_m=15.0, field_of_view_deg=120.0)
+    sensors = {"range_15": SENSORS["range_15"], "15 m, 120 degrees": wide}
+    sensors |= {name: SENSORS[name] for name in ("occlusion", "corners")}
+    sheet_of({name: perceived(sensor) for name, sensor in sensors.items()}, 2).save(
+        images / "sensors.png", optimize=True
+    )
+
+
+def perceived(sensor: Sensor) -> NDArray[np.uint8]:
+    """The street after two seconds in which the ego has crept forward."""
+    env = SceneEnv(TaskSettings(sensor=sensor), render_mode="rgb_array")
+    env.reset(seed=3)
+    for _ in range(20):
+        env.step(np.int64(1))
+    picture = env.render()
+    env.close()
+    assert picture is not None
+    return picture
+
+
+def sheet_of(pictures: Mapping[str, NDArray[np.uint8]], columns: int) -> Image.Image:
+    """All pictures in rows, each below its name."""
     titled = [titled_picture(name, picture) for name, picture in pictures.items()]
-    rows = [titled[:3], titled[3:]]
+    rows = [titled[first : first + columns] for first in range(0, len(titled), columns)]
     width, heights = titled[0].width + 8, [max(picture.height for picture in row) + 8 for row in rows]
-    sheet = Image.new("RGB", (3 * width, sum(heights)), "white")
+    sheet = Image.new("RGB", (columns * width, sum(heights)), "white")
     for number, row in enumerate(rows):
         for column, picture in enumerate(row):
             sheet.paste(picture, (column * width, sum(heights[:number])))
-    sheet.save(images / "scenes.png", optimize=True)
+    return sheet
 
 
 def titled_picture(name: str, picture: NDArray[np.uint8]) -> Image.Image:
@@ -189,9 +218,11 @@ if __name__ == "__main__":
     if sys.argv[1] == "--pictures":
         make_figures(IMAGES)
         make_pictures(IMAGES)
+        make_sensor_pictures(IMAGES)
         make_films()
         sys.exit()
     make_pictures(IMAGES)
+    make_sensor_pictures(IMAGES)
     make_traits(Path(sys.argv[1]))
     make_policies(Path(sys.argv[1]))
     make_figures(IMAGES)

@@ -10,7 +10,7 @@ import pytest
 
 from tint_sumo import traits
 from tint_sumo.cli import main
-from tint_sumo.config import NO_LEADER_GAP_M, PPO_BUDGETS, STEP_S
+from tint_sumo.config import NO_LEADER_GAP_M, PPO_BUDGETS, SENSORS, STEP_S
 from tint_sumo.core.percentages import percent
 from tint_sumo.envs.rows import OUTCOMES
 from tint_sumo.methods.registry import find_learned, learned_methods
@@ -184,6 +184,26 @@ def test_settings_of_the_training() -> None:
         f"{full.total_steps / 1e6:g} million decisions"
     ) in page
     assert f"that gap is {NO_LEADER_GAP_M:g} m" in _prose("docs/explanation/label-leak.md")
+
+
+def test_the_tables_of_sensors_are_those_of_the_results() -> None:
+    policies, rules = _tables(DOCS / "how-to" / "sensors.md")[1:]
+    found = pandas.read_csv(RESULTS / "sensors.csv").set_index(["sensor", "policy"])
+    lines = policies.strip().split("\n")[2:]
+    assert len(lines) == len(SENSORS)
+    for line, sensor in zip(lines, SENSORS, strict=True):
+        cells = [_outcomes(found.loc[(sensor, policy)]) for policy in ("no_labels", "cross_window", "oracle")]
+        assert line == f"| `{sensor}` | {' | '.join(cells)} |"
+    found = pandas.read_csv(RESULTS / "creeping.csv")
+    lines = rules.strip().split("\n")[2:]
+    for line, (_, row) in zip(lines, found.groupby("sensor", sort=False), strict=True):
+        start, lane = (row.iloc[number] for number in range(2))
+        gained = f"{lane['success_percent'] - start['success_percent']:.1f}"
+        assert line.split(" | ", 1)[1] == f"{_outcomes(start)} | {_outcomes(lane)} | {gained} |"
+
+
+def _outcomes(row: pandas.Series) -> str:
+    return " / ".join(str(row[f"{outcome}_percent"]) for outcome in OUTCOMES)
 
 
 _ONCE = pandas.read_csv(RESULTS / "once.csv")

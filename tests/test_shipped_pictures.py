@@ -33,6 +33,11 @@ def test_pictures_of_scenes_are_those_of_their_episodes(make_shipped: ModuleType
     assert_pictures_are_shipped(tmp_path, {"scene.png", "scenes.png"})
 
 
+def test_pictures_of_sensors_show_the_same_moment(make_shipped: ModuleType, tmp_path: Path) -> None:
+    make_shipped.make_sensor_pictures(tmp_path)
+    assert_pictures_are_shipped(tmp_path, {"sensors.png"})
+
+
 def assert_pictures_are_shipped(folder: Path, names: set[str]) -> None:
     """Compare pictures in a folder with those in data/images, but for the edges of letters, which fonts decide."""
     assert {file.name for file in folder.iterdir()} == names

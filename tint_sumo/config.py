@@ -478,6 +478,11 @@ _FULL_PPO = PpoSettings(
     ),
 )
 
+# In a SUMO configuration each environment is a process. There are no classes of drivers to wait for, and less to learn.
+NETWORK_PPO = replace(
+    _FULL_PPO, n_envs=8, n_steps=128, n_minibatches=4, learning_rate=1e-3, gamma=0.99, total_steps=200_000
+)
+
 PPO_BUDGETS = {
     "quick": replace(_FULL_PPO, n_envs=64, total_steps=200_000),
     "full": _FULL_PPO,

@@ -36,6 +36,7 @@ COMMAND_LINES = (
     "traits study --workers 1",
     "policy train --method oracle --out run --steps 10 --budget quick --scene all --zip",
     "policy train --method oracle --out run --p-conservative 0.4",
+    "policy train --method no_labels --out run --sumocfg mine.sumocfg --ego-route a b --goal-m 90.5 --speeds-mps 0 5 9",
     "policy evaluate --model ttc --p-conservative 0.1 0.9 --scene roundabout --tau 1.5",
     "policy evaluate --model no",
     "policy evaluate --model ttc --sensor range_15",
@@ -343,7 +344,7 @@ def test_a_sumo_configuration_as_a_scene(
     assert "leave p_conservative out" in refuse(capsys, *argv)
     evaluation = ("policy", "evaluate", "--episodes", 1, "--model")
     assert "leave tau_s out" in refuse(capsys, *evaluation, "run", "--tau", 2)
-    assert "ttc needs a built-in scene" in refuse(capsys, *evaluation, "ttc", "--config", file)
+    assert run(capsys, *evaluation, "ttc", "--config", file)["scene"] == "merge"
     assert "a film needs a built-in scene" in refuse(capsys, "render", "--model", "run", "--out", "film.gif")
     assert "a study needs a built-in scene" in refuse(capsys, "study", "run", "--out", "study", "--config", file)
     assert "a network needs a built-in scene" in refuse(capsys, "net", "--config", file)

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from tests.envs.test_workers import assert_infos_equal
 from tests.scenes.networks import USER_NETWORKS, UserNetwork
 from tint_sumo import SCENE_ENV_ID
-from tint_sumo.config import SENSORS
+from tint_sumo.config import SENSORS, EgoController
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
@@ -84,6 +84,16 @@ def test_the_traits_are_the_numbers_of_the_vtypes(user_network: Make) -> None:
             assert env.step(0)[3]
             assert env.snapshot().actions == (0,) * 200
     assert seen == {-1, 0, 1}
+
+
+def test_the_speed_of_a_fast_ego_is_seen(user_network: Make) -> None:
+    with made(user_network("merge").scene(controller=EgoController((0.0, 5.0, 12.0)))) as env:
+        env.reset(seed=1)
+        for _ in range(20):
+            observation, *_ = env.step(2)
+        egos = env.simulation.egos
+        assert egos.speed_mps[0] > 4.0
+        assert 12.0 * np.hypot(*observation["ego"][2:]) == pytest.approx(egos.speed_mps[0], rel=1e-5)
 
 
 def test_a_vector_has_as_many_workers_as_environments(user_network: Make) -> None:

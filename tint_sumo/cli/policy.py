@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import arg, subcommand
 
-from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, use_one_thread, wrote
+from tint_sumo.cli.command import RESUMES, Outcome, SpreadCommand, use_one_thread, wrote
+from tint_sumo.cli.own_network import NetworkCommand
 from tint_sumo.cli.values import (
     PPO_BUDGET,
     SCENES,
@@ -25,7 +26,7 @@ from tint_sumo.cli.values import (
     TestTau,
     optional,
 )
-from tint_sumo.config import SENSORS, Decisions, Mix, NoiseM, Seed, Sensor
+from tint_sumo.config import NETWORK_PPO, SENSORS, Decisions, Mix, NoiseM, Seed, Sensor
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.ranges import Processes
@@ -58,7 +59,7 @@ _SWEEP_MIX = arg(
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainPolicy(Command):
+class TrainPolicy(NetworkCommand):
     """Train a navigation policy with PPO; the same command resumes an interrupted training."""
 
     after_interrupt: ClassVar[str] = RESUMES
@@ -72,7 +73,8 @@ class TrainPolicy(Command):
     seed: Seed = 0
     """Seed of the training, 0 to 1000."""
     budget: PpoBudgetValue = "full"
-    """Size of the network, settings of PPO and number of decisions; full takes 5 to 8 minutes on a free core."""
+    """Size of the network, settings of PPO and number of decisions; full takes 5 to 8 minutes on a free core. In a SUMO
+    configuration full has 8 environments, each a process, and 200,000 decisions."""
     sensor: Annotated[SensorValue, _SENSOR] = "perfect"
     scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}, or all of them at once: all.")] = "t_intersection"
     traits: Annotated[str | None, _TRAITS] = None
@@ -89,9 +91,12 @@ class TrainPolicy(Command):
         from tint_sumo.scenes import find_scenes
 
         use_one_thread()
+        scene = self.scene_of(self.scene)
         is_given = self.p_conservative != TrainPolicy.p_conservative
-        has_mix = is_given or find_scenes(self.scene)[0].sumocfg is None
-        settings = PPO_BUDGET.full(self.budget)
+        in_network = find_scenes(scene)[0].sumocfg is not None
+        has_mix = is_given or not in_network
+        is_default = self.budget == TrainPolicy.budget
+        settings = NETWORK_PPO if in_network and is_default else PPO_BUDGET.full(self.budget)
         steps = settings.total_steps if self.steps is None else self.steps
         mix = Mix.parse(self.p_conservative) if has_mix else None
         with one_job(f"train {self.method}") as report:
@@ -102,7 +107,7 @@ class TrainPolicy(Command):
                 self.seed,
                 self.out,
                 settings=settings,
-                scene=self.scene,
+                scene=scene,
                 sensor=find_sensor(self.sensor),
                 traits=self.traits,
                 other_scene=self.other_scene,
@@ -110,12 +115,16 @@ class TrainPolicy(Command):
                 film=film_policy,
                 report=report,
             )
-        content = {"model": str(policy), "method": self.method, "p_conservative": self.p_conservative}
+        content = {
+            "model": str(policy),
+            "method": self.method,
+            "p_conservative": self.p_conservative if has_mix else None,
+        }
         return Outcome(f"trained {self.method}: {policy}", {**content, "steps": steps, "seed": self.seed})
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluatePolicy(SpreadCommand):
+class EvaluatePolicy(NetworkCommand, SpreadCommand):
     """Evaluate a policy on unseen test episodes (cases), which are the same for every policy."""
 
     model: PolicyName
@@ -140,7 +149,7 @@ class EvaluatePolicy(SpreadCommand):
         from tint_sumo.methods.loading import load_policy
 
         use_one_thread()
-        contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
+        contender = load_policy(self.model, scene=self.scene_of(self.scene), allow_pickle=self.allow_pickle)
         task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau)
         with self.workers_of(1) as workers:
             if isinstance(workers, int):

@@ -4,7 +4,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tint_sumo.cli.command import Command, Outcome, use_one_thread
+from tint_sumo.cli.command import Outcome, use_one_thread
+from tint_sumo.cli.own_network import NetworkCommand
 from tint_sumo.cli.policy import content_of, task_of
 from tint_sumo.cli.values import PolicyName, TestMix, TestScene, TestSensor, TestTau
 from tint_sumo.config import NoiseM, Seed
@@ -12,7 +13,7 @@ from tint_sumo.core.ranges import Range
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Command):
+class Render(NetworkCommand):
     """Film one test episode (case): the drivers' traits, those that the policy infers, its attention and actions."""
 
     model: PolicyName
@@ -39,7 +40,7 @@ class Render(Command):
 
         require_film_file(self.out)
         use_one_thread()
-        contender = load_policy(self.model, scene=self.scene, allow_pickle=self.allow_pickle)
+        contender = load_policy(self.model, scene=self.scene_of(self.scene), allow_pickle=self.allow_pickle)
         task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau)
         with one_job(f"render {self.out}") as report:
             film = render_case(contender, self.case, self.out, case_set=self.seed, task=task, report=report)

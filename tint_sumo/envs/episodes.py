@@ -15,7 +15,6 @@ from tint_sumo.config import (
     POSITION_SCALE_M,
     REWARD_PRESETS,
     SENSORS,
-    SPEED_SCALE_MPS,
     Backend,
     Decisions,
     Mix,
@@ -193,7 +192,7 @@ class Episodes:
         traits = (*self.simulation.trait_of_member, NO_VEHICLE)  # the last one stands for empty slots
         self._trait_of_member = np.array(traits, np.int8)
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
-        self._scales = Scales(POSITION_SCALE_M, SPEED_SCALE_MPS, scene.step_s)
+        self._scales = Scales(POSITION_SCALE_M, scene.speed_scale_mps, scene.step_s)
         self._speeds_mps = np.array(scene.ego.controller.desired_speeds_mps)
         self._steps_per_decision = settings.steps_per_decision
         self.steps = np.zeros(num_envs, np.int64)  # simulation steps since each episode's start

@@ -89,7 +89,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     * `scene`: name of a scene, a `tint_sumo.scenes.Scene`, or what `tint_sumo.scenes.from_sumocfg` makes of a SUMO
       configuration of your own. Then the traffic is the configuration's, several lanes and changes between them
-      included; `ego` is seen from where it starts, with the network's axes; `vehicles` are the nearest in sight;
+      included; `ego` is seen from where it starts, with the network's axes, its velocities divided by its top speed if
+      that is above 3 m/s; `vehicles` are the nearest in sight;
       `traits` are the numbers of their vTypes in `scene.vtypes`; `position_m` is what their odometers show, and
       `passed` is always 0. Such an environment is one simulation: a vector of them needs as many `workers` as
       environments.

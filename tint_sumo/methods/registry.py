@@ -172,9 +172,11 @@ def always_go(_: "AnyScene") -> Policy:
 
 
 def time_to_collision(scene: "AnyScene") -> Policy:
+    from tint_sumo.methods.network_ttc import NetworkTimeToCollision
     from tint_sumo.methods.rules import TimeToCollision
+    from tint_sumo.scenes import SumocfgScene
 
-    return TimeToCollision(scene=scene)
+    return NetworkTimeToCollision(scene) if isinstance(scene, SumocfgScene) else TimeToCollision(scene=scene)
 
 
 def no_traits() -> "TraitSource":

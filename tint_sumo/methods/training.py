@@ -48,6 +48,7 @@ ZIP_FILE = "policy.zip"
 CURVE_FILE = "curve.csv"
 TRAITS = "traits"  # name of the trait model beside a policy
 RECENT_EPISODES = 500
+_MOST_SIMULATIONS = 32  # environments of a training in a SUMO configuration
 
 
 def snapshot_stem(out: Path, percent: int) -> Path:
@@ -116,6 +117,11 @@ def train_policy(
     if encoder is not None and not other_scene:
         require_scene(traits or str(learned.encoder), trained_in["scene"], trained_in["scene_digest"], "the policy")
     settings = learned.settings_of(settings)
+    if scenes[0].sumocfg and settings.n_envs > _MOST_SIMULATIONS:
+        raise InputError(
+            f"each environment in a SUMO configuration is a process; n_envs must be at most {_MOST_SIMULATIONS}, not "
+            f"{settings.n_envs}"
+        )
     identity = {
         "kind": "policy",
         "method": method,

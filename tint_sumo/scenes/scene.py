@@ -12,6 +12,7 @@ from typing import ClassVar
 import shapely
 
 from tint_sumo.config import (
+    SPEED_SCALE_MPS,
     Claim,
     EgoController,
     Mix,
@@ -129,6 +130,11 @@ class Scene:
     def speed_limit_mps(self) -> float:
         """Speed that no vehicle exceeds."""
         return self.network.speed_limit_mps
+
+    @property
+    def speed_scale_mps(self) -> float:
+        """Velocities are observed divided by this."""
+        return SPEED_SCALE_MPS
 
     def with_drivers(self, p_conservative: Mix | None, tau_s: float | None) -> "Scene":
         """Return the scene with another mix and another time headway of its drivers, where they are given."""

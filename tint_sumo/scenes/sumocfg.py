@@ -20,7 +20,17 @@ import shapely
 import sumolib
 from sumolib.miscutils import parseTime
 
-from tint_sumo.config import MOST_LABELS, DistanceM, EgoController, Slots, TimeS, VehicleShape, WarmStarts, WarmUpS
+from tint_sumo.config import (
+    MOST_LABELS,
+    SPEED_SCALE_MPS,
+    DistanceM,
+    EgoController,
+    Slots,
+    TimeS,
+    VehicleShape,
+    WarmStarts,
+    WarmUpS,
+)
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import require_ranges
 from tint_sumo.core.reading import TABLE_BYTES, require_file
@@ -138,6 +148,11 @@ class SumocfgScene:
         """The task; the controller's gain is such that a speed is reached, and not passed, in a step of any length."""
         controller = replace(self.controller, gain_per_s=min(self.controller.gain_per_s, 1.0 / self.step_s))
         return EgoTask(self.ego_route, self.start_m, self.goal_m, controller=controller)
+
+    @property
+    def speed_scale_mps(self) -> float:
+        """Velocities are observed divided by this: the ego's top speed, if that is more than in the built-in scenes."""
+        return max(SPEED_SCALE_MPS, self.controller.desired_speeds_mps[-1])
 
     @property
     def departure(self) -> tuple[tuple[str, ...], float]:

@@ -478,13 +478,18 @@ _FULL_PPO = PpoSettings(
     ),
 )
 
-# In a SUMO configuration each environment is a process. There are no classes of drivers to wait for, and less to learn.
-NETWORK_PPO = replace(
-    _FULL_PPO, n_envs=8, n_steps=128, n_minibatches=4, learning_rate=1e-3, gamma=0.99, total_steps=200_000
-)
-
 PPO_BUDGETS = {
     "quick": replace(_FULL_PPO, n_envs=64, total_steps=200_000),
     "full": _FULL_PPO,
     "paper": PpoSettings(),
 }
+
+
+def network_ppo(step_s: float) -> PpoSettings:
+    """Return the settings of a training in a SUMO configuration with this step: a decision about every 0.4 s.
+
+    Each environment is a process there, hence few of them.
+    """
+    every = max(round(_FULL_PPO.action_repeat * STEP_S / step_s), 1)
+    batch = replace(_FULL_PPO, n_envs=8, n_steps=128, n_minibatches=4)
+    return replace(batch, learning_rate=1e-3, gamma=0.99, total_steps=200_000, action_repeat=every)

@@ -1,6 +1,7 @@
 """Rows written after a step that is made by hand."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.scenes.networks import UserNetwork
 from tint_sumo.config import REWARD_PRESETS
 from tint_sumo.envs.rows import (
     OUTCOMES,
@@ -211,3 +213,14 @@ def test_rules_are_those_of_the_scene_and_of_the_preset() -> None:
     assert TaskRules.of(scene, preset) == TaskRules(34.0, 500, 2.5, -2.0, 0.05 / 3.0, -0.013)
     assert TaskRules.of(replace(scene, time_limit_s=0.3), preset).step_limit == 3
     assert TaskRules.of(replace(scene, time_limit_s=3.0, step_s=0.2), preset).step_limit == 15
+
+
+def test_a_second_in_a_sumo_configuration_is_worth_as_much_whatever_the_step_and_the_top_speed(
+    user_network: Callable[[str], UserNetwork],
+) -> None:
+    preset = REWARD_PRESETS["paper"]
+    for name, step_s, top_mps in (("merge", 0.1, 3.0), ("grid", 1.0, 3.0), ("autobahn", 0.5, 12.0)):
+        rules = TaskRules.of(user_network(name).scene(), preset)
+        assert rules.speed_weight_per_mps * top_mps / step_s == pytest.approx(0.05 * 3.0 / 0.1)
+        assert rules.step / step_s == pytest.approx(-0.0013 / 0.1)
+        assert (rules.goal, rules.collision) == (2.5, -2.0)

@@ -26,7 +26,7 @@ from tint_sumo.cli.values import (
     TestTau,
     optional,
 )
-from tint_sumo.config import NETWORK_PPO, SENSORS, Decisions, Mix, NoiseM, Seed, Sensor
+from tint_sumo.config import SENSORS, Decisions, Mix, NoiseM, Seed, Sensor, network_ppo
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.ranges import Processes
@@ -93,10 +93,10 @@ class TrainPolicy(NetworkCommand):
         use_one_thread()
         scene = self.scene_of(self.scene)
         is_given = self.p_conservative != TrainPolicy.p_conservative
-        in_network = find_scenes(scene)[0].sumocfg is not None
-        has_mix = is_given or not in_network
+        first = find_scenes(scene)[0]
+        has_mix = is_given or first.sumocfg is None
         is_default = self.budget == TrainPolicy.budget
-        settings = NETWORK_PPO if in_network and is_default else PPO_BUDGET.full(self.budget)
+        settings = network_ppo(first.step_s) if first.sumocfg and is_default else PPO_BUDGET.full(self.budget)
         steps = settings.total_steps if self.steps is None else self.steps
         mix = Mix.parse(self.p_conservative) if has_mix else None
         with one_job(f"train {self.method}") as report:

@@ -2,13 +2,12 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.config import RewardPreset
+from tint_sumo.config import SPEED_SCALE_MPS, STEP_S, RewardPreset
 from tint_sumo.core.compiling import compiled
 from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.scene import Scene
@@ -111,7 +110,22 @@ class TaskRules(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene | SumocfgScene, preset: RewardPreset) -> "TaskRules":
-        return cls(scene.ego.goal_m, round(scene.time_limit_s / scene.step_s), *astuple(preset))
+        """Return the rules of a scene.
+
+        In a SUMO configuration, driving at top speed for a second is worth as much as in the built-in scenes, whatever
+        that speed and the step are, and so is waiting.
+        """
+        steps, tops = 1.0, 1.0  # steps of built-in scenes in one, and top speeds of built-in scenes in the ego's
+        if isinstance(scene, SumocfgScene):
+            steps, tops = scene.step_s / STEP_S, scene.ego.controller.desired_speeds_mps[-1] / SPEED_SCALE_MPS
+        return cls(
+            scene.ego.goal_m,
+            round(scene.time_limit_s / scene.step_s),
+            preset.goal,
+            preset.collision,
+            preset.speed_weight_per_mps * steps / tops,
+            preset.step * steps,
+        )
 
 
 @compiled

@@ -57,6 +57,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `speed`     | 0.05 x ego speed (m/s) otherwise  | 0.05 / 3 x ego speed otherwise    |
     | `step`      | -0.0013 otherwise                 | -0.013 otherwise                  |
 
+    In a SUMO configuration with steps of T s and a top speed of M m/s, `step` is multiplied by T / 0.1, and `speed` by
+    T / 0.1 x 3 / M: a second is worth as much as in the built-in scenes.
+
     ## Starting State
     The ego stands at its start (in the T-intersection with its centre at (0, -5)). All of the traffic's routes are
     filled at random; each driver is conservative with probability `p_conservative`.

@@ -17,7 +17,7 @@ from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.trait_sources import Observation, OracleTraits, one_hot
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
 from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers
-from tint_sumo.simulation.scene import SceneSimulation
+from tint_sumo.simulation import SceneSimulation, Simulation
 
 _BRAKING_MPS2 = 0.5  # vehicles that slow down by more than this show it
 
@@ -39,7 +39,7 @@ class Moment:
     traits: Numbers  # (V,) true ones: numbers of profiles, -1 in empty slots
     observed_traits: Floats | None  # (V, Z) traits in the policy's observation; None where it has none
     attention: Floats | None  # (V,)
-    claimed: Bools  # (K,)
+    claimed: Bools  # (K,); of no routes in a SUMO configuration
     desired_mps: float | None  # the policy's action; None before its first
     value: float | None  # return that the policy expected when it chose the action
     outcome: str  # empty until the end
@@ -51,6 +51,7 @@ class Driven:
 
     case: Case
     moments: tuple[Moment, ...]
+    origin_m: tuple[float, float]  # position of the scene's origin in the network
 
 
 def drive_case(contender: Contender, case: int, case_set: int, task: TaskSettings) -> Driven:
@@ -70,7 +71,7 @@ def drive_case(contender: Contender, case: int, case_set: int, task: TaskSetting
         return venv
 
     evaluation = evaluate(recorder, make_venv, 1, case_set, first=case)
-    return Driven(evaluation.cases[0], tuple(recorder.moments))
+    return Driven(evaluation.cases[0], tuple(recorder.moments), recorder.origin_m)
 
 
 class _Recorder:
@@ -84,13 +85,13 @@ class _Recorder:
         self._desired_mps: float | None = None
         self._value: float | None = None
         self.moments: list[Moment] = []
+        self.origin_m = (0.0, 0.0)
 
     def attach(self, venv: VecEnv) -> None:
         """Look at the simulation of these environments from now on."""
         base = venv.unwrapped
         assert isinstance(base, SceneVecEnv) and isinstance(base.env.batch, LocalBatch)
         simulation = base.env.batch.episodes.simulation
-        assert isinstance(simulation, SceneSimulation)  # films show built-in scenes
         self._simulation = simulation
         self._episodes = base.env.batch.episodes
         self._speeds = _Speeds(simulation)
@@ -128,6 +129,7 @@ class _Recorder:
         if self.moments and self.moments[-1].outcome:
             return
         simulation, (info,) = self._simulation, infos
+        self.origin_m = simulation.origin_m
         egos, slots = simulation.egos, simulation.slots
         brakes, ego_brakes = self._speeds.brakes()
         attention = None if self._network is None else self._network.attention_weights(observation)[0]
@@ -148,7 +150,7 @@ class _Recorder:
                 traits=of_member[slots.member[0]],
                 observed_traits=self._by_vehicle(observation[TRAITS][0]) if TRAITS in observation else None,
                 attention=None if attention is None else self._by_vehicle(attention),
-                claimed=simulation.yielding.has_claimed[0].copy(),
+                claimed=_claimed(simulation),
                 desired_mps=self._desired_mps,
                 value=self._value,
                 outcome=info.get("outcome", ""),  # the info of a reset has none
@@ -163,10 +165,17 @@ class _Recorder:
         return placed
 
 
+def _claimed(simulation: Simulation) -> Bools:
+    """Return which routes (K,) the ego claims."""
+    if isinstance(simulation, SceneSimulation):
+        return np.array(simulation.yielding.has_claimed[0])
+    return np.zeros(0, bool)
+
+
 class _Speeds:
     """Finds the vehicles that brake, from their positions at each step."""
 
-    def __init__(self, simulation: SceneSimulation) -> None:
+    def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
         self._step_s = simulation.scene.step_s
         self._who = np.full(simulation.scene.max_vehicles, -1)

@@ -18,13 +18,13 @@ from tint_sumo.scenes.layout import Layout
 Colour = tuple[int, ...]
 
 SIZE_PX = (640, 480)
-_TITLE_HEIGHT_PX, _SCENE_HEIGHT_PX = 30, 346  # the rest of a frame is words
-_OVERSAMPLING = 2
+TITLE_HEIGHT_PX, SCENE_HEIGHT_PX = 30, 346  # the rest of a frame is words
+OVERSAMPLING = 2
 _OUTLINE_M, _RING_M = 0.28, 0.12  # outline of the true trait, and white line around the inferred one
 _LAMP_M, _EDGE_M = 0.45, 0.12
 HALO_M = (1.6, 5.5)  # radius of the halo of a vehicle without weight, and of one that has it all
 LEAST_WEIGHT = 0.03  # a vehicle with less has no halo
-_EGO, _UNSURE, _WHITE = (240, 180, 0), (190, 190, 190), (255, 255, 255)
+EGO_COLOUR, _UNSURE, _WHITE = (240, 180, 0), (190, 190, 190), (255, 255, 255)
 _LAMP, _GLASS, _INK, _PAPER, _FAINT = (255, 40, 40), (43, 47, 51), (30, 33, 37), (250, 250, 247), (110, 116, 122)
 _HALO, _CLAIM, _WAY = (255, 225, 60, 105), (0, 150, 140, 75), (240, 180, 0, 130)
 _HALO_KEY, _CLAIM_KEY = (225, 210, 95), (100, 149, 151)  # how they look on the road
@@ -45,13 +45,13 @@ class Artist:
     def frame(self, moment: Moment) -> Image.Image:
         """Return an RGB image of ``SIZE_PX``."""
         image = self._paper.copy()
-        image.paste(self._scene(moment), (0, _TITLE_HEIGHT_PX))
-        self._write(ImageDraw.Draw(image), moment)
+        image.paste(self._scene(moment), (0, TITLE_HEIGHT_PX))
+        write_state(ImageDraw.Draw(image), moment, _noticed(self.layout, moment))
         return image
 
     def _scene(self, moment: Moment) -> Image.Image:
         empty = _roads(self.layout)
-        canvas = Canvas(_view(self.layout), empty.copy(), width_px=SIZE_PX[0], oversampling=_OVERSAMPLING)
+        canvas = Canvas(_view(self.layout), empty.copy(), width_px=SIZE_PX[0], oversampling=OVERSAMPLING)
         lanes = _lanes(self.layout)
         for route in np.flatnonzero(moment.claimed).tolist():
             canvas.fill(lanes[route], _CLAIM)
@@ -67,9 +67,9 @@ class Artist:
                 self._draw_vehicle(canvas, moment.boxes[slot], outline, fills[slot], bool(moment.brakes[slot]))
             else:
                 canvas.vehicle(moment.boxes[slot], pale(outline), with_glass=False)
-        self._draw_vehicle(canvas, moment.ego, _INK, _EGO, moment.ego_brakes)
+        self._draw_vehicle(canvas, moment.ego, _INK, EGO_COLOUR, moment.ego_brakes)
         canvas.sight(self.sensor, moment.ego)
-        return canvas.drawing.reduce(_OVERSAMPLING)
+        return canvas.drawing.reduce(OVERSAMPLING)
 
     def _fills(self, moment: Moment) -> list[Colour]:
         """Return the colour of each slot's likelier trait, the greyer the less sure; white where none is inferred."""
@@ -94,43 +94,51 @@ class Artist:
             _draw_lamp(canvas, pose, back_m, (-side_m, -side_m + 2 * _LAMP_M))
             _draw_lamp(canvas, pose, back_m, (side_m - 2 * _LAMP_M, side_m))
 
-    def _write(self, draw: ImageDraw.ImageDraw, moment: Moment) -> None:
-        top = _TITLE_HEIGHT_PX + _SCENE_HEIGHT_PX + 8
-        draw.text((10, top), f"{moment.time_s:4.1f} s", font=_font(24), fill=_INK)
-        draw.text((110, top + 1), _wanted(moment), font=_font(15), fill=_INK)
-        draw.text((110, top + 21), _noticed(self.layout, moment), font=_font(15), fill=_INK)
-        draw.text((630, top), moment.outcome, font=_font(24), fill=_OUTCOMES.get(moment.outcome, _INK), anchor="ra")
-
     @cached_property
     def _paper(self) -> Image.Image:
         """Draw the title and the legend, which are the same in all moments."""
-        image = Image.new("RGB", SIZE_PX, _PAPER)
-        draw, top = ImageDraw.Draw(image), SIZE_PX[1] - 46
-        draw.rectangle((10, 8, 24, 22), fill=self.colour)
-        draw.text((32, 6), self.title, font=_font(15), fill=_INK)
+        (image, draw), top = new_paper(self.title, self.colour), SIZE_PX[1] - 46
         first, second = self.layout.scene.population.profiles
-        left = _key(draw, (10, top), f"true trait: {first.name}", outline=_parts(first.colour))
-        left = _key(draw, (left, top), second.name, outline=_parts(second.colour))
-        left = _key(draw, (left, top), "brakes", outline=_LAMP, fill=_LAMP)
-        left = _key(draw, (left, top), "claimed lane", fill=_CLAIM_KEY)
+        left = write_key(draw, (10, top), f"true trait: {first.name}", outline=_parts(first.colour))
+        left = write_key(draw, (left, top), second.name, outline=_parts(second.colour))
+        left = write_key(draw, (left, top), "brakes", outline=_LAMP, fill=_LAMP)
+        left = write_key(draw, (left, top), "claimed lane", fill=_CLAIM_KEY)
         if self.has_attention:
-            _key(draw, (left, top), "attention", fill=_HALO_KEY)
+            write_key(draw, (left, top), "attention", fill=_HALO_KEY)
         below = top + 22
         if self.reader is None:
             draw.text((10, below), "this policy has no traits of the others", font=_font(13), fill=_FAINT)
             self._add_hidden(draw, (280, below))
             return image
-        left = _key(draw, (10, below), f"inferred trait: {first.name}", fill=_parts(first.colour))
-        left = _key(draw, (left, below), second.name, fill=_parts(second.colour))
-        left = _key(draw, (left, below), "unsure", fill=_UNSURE)
-        left = _key(draw, (left, below), "nothing inferred", outline=_FAINT, fill=_WHITE)
+        left = write_key(draw, (10, below), f"inferred trait: {first.name}", fill=_parts(first.colour))
+        left = write_key(draw, (left, below), second.name, fill=_parts(second.colour))
+        left = write_key(draw, (left, below), "unsure", fill=_UNSURE)
+        left = write_key(draw, (left, below), "nothing inferred", outline=_FAINT, fill=_WHITE)
         self._add_hidden(draw, (left, below))
         return image
 
     def _add_hidden(self, draw: ImageDraw.ImageDraw, at: tuple[int, int]) -> None:
         """Add vehicles that are not seen to the legend, if there can be any."""
         if self.sensor.hides:
-            _key(draw, at, "not seen", fill=pale(_parts(self.layout.scene.population.profiles[0].colour)))
+            write_key(draw, at, "not seen", fill=pale(_parts(self.layout.scene.population.profiles[0].colour)))
+
+
+def new_paper(title: str, colour: Colour) -> tuple[Image.Image, ImageDraw.ImageDraw]:
+    """Return an empty frame with its title, and what draws on it."""
+    image = Image.new("RGB", SIZE_PX, _PAPER)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle((10, 8, 24, 22), fill=colour)
+    draw.text((32, 6), title, font=_font(15), fill=_INK)
+    return image, draw
+
+
+def write_state(draw: ImageDraw.ImageDraw, moment: Moment, noticed: str) -> None:
+    """Draw the time, what the policy wants, a line of what else there is to notice, and the outcome."""
+    top = TITLE_HEIGHT_PX + SCENE_HEIGHT_PX + 8
+    draw.text((10, top), f"{moment.time_s:4.1f} s", font=_font(24), fill=_INK)
+    draw.text((110, top + 1), _wanted(moment), font=_font(15), fill=_INK)
+    draw.text((110, top + 21), noticed, font=_font(15), fill=_INK)
+    draw.text((630, top), moment.outcome, font=_font(24), fill=_OUTCOMES.get(moment.outcome, _INK), anchor="ra")
 
 
 def _wanted(moment: Moment) -> str:
@@ -150,7 +158,7 @@ def _noticed(layout: Layout, moment: Moment) -> str:
     return text + ("     held by the safety check" if moment.is_held else "")
 
 
-def _key(
+def write_key(
     draw: ImageDraw.ImageDraw,
     at: tuple[int, int],
     text: str,
@@ -205,8 +213,8 @@ def _view(layout: Layout) -> View:
     """Return the scene's view, with more around it where a frame has room."""
     view = layout.scene.view
     width_m, height_m = view.right_m - view.left_m, view.top_m - view.bottom_m
-    m_per_px = max(width_m / SIZE_PX[0], height_m / _SCENE_HEIGHT_PX)
-    half_width_m, half_height_m = SIZE_PX[0] * m_per_px / 2, _SCENE_HEIGHT_PX * m_per_px / 2
+    m_per_px = max(width_m / SIZE_PX[0], height_m / SCENE_HEIGHT_PX)
+    half_width_m, half_height_m = SIZE_PX[0] * m_per_px / 2, SCENE_HEIGHT_PX * m_per_px / 2
     x_m, y_m = (view.left_m + view.right_m) / 2, (view.bottom_m + view.top_m) / 2
     return View(x_m - half_width_m, y_m - half_height_m, x_m + half_width_m, y_m + half_height_m)
 
@@ -214,13 +222,13 @@ def _view(layout: Layout) -> View:
 @cache
 def _roads(layout: Layout) -> Image.Image:
     """Return the empty roads with the ego's way; not to be drawn on."""
-    roads = background(layout.roads, _view(layout), SIZE_PX[0], _OVERSAMPLING).copy()
-    canvas = Canvas(_view(layout), roads, width_px=SIZE_PX[0], oversampling=_OVERSAMPLING)
+    roads = background(layout.roads, _view(layout), SIZE_PX[0], OVERSAMPLING).copy()
+    canvas = Canvas(_view(layout), roads, width_px=SIZE_PX[0], oversampling=OVERSAMPLING)
     for building in layout.scene.buildings:
         canvas.fill(shapely.Polygon(building), BUILDING_COLOUR)
     task = layout.scene.ego
     way = _between(layout.ego.way, task.start_m, task.goal_m)
-    canvas.draw.line(canvas.pixels(way), fill=_WAY, width=3 * _OVERSAMPLING, joint="curve")
+    canvas.draw.line(canvas.pixels(way), fill=_WAY, width=3 * OVERSAMPLING, joint="curve")
     return canvas.drawing
 
 

@@ -30,22 +30,22 @@ def test_a_film_runs_in_real_time_whatever_the_step(name: str, fps: float, user_
 
 
 def test_a_frame_shows_the_ego_in_its_middle_and_each_vehicle_in_the_colour_of_its_vtype(user_network: Make) -> None:
-    scene = user_network("merge").scene(time_limit_s=8.0)
+    scene = user_network("merge").scene(start_m=60.0, time_limit_s=12.0)
     contender = load_policy("always_go", scene=scene)
-    driven = drive_case(contender, 1, 0, contender.task)
-    case = evaluate(contender.policy, lambda n: contender.make_venv(n, contender.task), 1, 0, first=1).cases[0]
+    driven = drive_case(contender, 5, 0, contender.task)
+    case = evaluate(contender.policy, lambda n: contender.make_venv(n, contender.task), 1, 0, first=5).cases[0]
     assert driven.case == case
     vtypes = vtypes_in(driven.moments)
     assert set(vtypes) == {0, 1}
     artist = NetworkArtist(scene, "title", (1, 2, 3), vtypes, driven.origin_m)
     shown = 0
-    for moment in (driven.moments[0], driven.moments[-1]):
+    for moment in driven.moments[::10]:
         picture = np.asarray(artist.frame(moment).crop(SPACE))
         down, across = np.nonzero(np.isclose(picture, EGO_COLOUR, atol=6).all(axis=2))
         assert abs(down.mean() - SCENE_HEIGHT_PX / 2) < 3.0
         assert abs(across.mean() - SIZE_PX[0] / 2) < 3.0
         away_m = np.hypot(moment.boxes["x_m"] - moment.ego["x_m"], moment.boxes["y_m"] - moment.ego["y_m"])
-        near = moment.present & (away_m < 20.0)
+        near = moment.present & (away_m < 24.0)  # the others may be outside of the frame
         shown += near.sum()
         for number in set(moment.traits[near].tolist()):
             assert np.isclose(picture, scene.trait_colours[number], atol=6).all(axis=2).sum() > 30

@@ -87,7 +87,7 @@ def test_a_trait_that_no_driver_has(dataset: Path, tmp_path: Path) -> None:
         some,
     )
     plot(lonely, tmp_path / "figure.png")
-    assert "aggressive, speed (m/s)" in report(lonely)
+    assert "no drivers: aggressive" in report(lonely)
 
 
 @pytest.mark.parametrize("part", [TRAJECTORIES, DRIVERS])

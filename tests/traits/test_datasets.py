@@ -1,15 +1,18 @@
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.scenes.networks import UserNetwork, write_config
 from tests.simulation.scenes import T
 from tint_sumo.cli import main
 from tint_sumo.config import CONSERVATIVE_LABEL, TraitSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.recorder import record
+from tint_sumo.dataset.sumocfg_recorder import record_sumocfg
 from tint_sumo.dataset.windows import Windows, load_labels, load_windows, split_by_episode
 from tint_sumo.traits import TRAIT_METHODS, datasets
 from tint_sumo.traits.datasets import evaluate_traits, plot_traits, train_traits
@@ -84,9 +87,9 @@ def test_evaluation_and_pictures_take_the_episodes_left_out_by_the_model_s_seed(
     drawn: list[tuple[np.ndarray, np.ndarray]] = []
     original = datasets.plot_latents
 
-    def plot(model: Any, windows: Windows, conservative: np.ndarray, *args: Any, **kwargs: Any) -> None:
-        drawn.append((windows.episode, conservative))
-        original(model, windows, conservative, *args, **kwargs)
+    def plot(model: Any, windows: Windows, labels: np.ndarray, *args: Any, **kwargs: Any) -> None:
+        drawn.append((windows.episode, labels))
+        original(model, windows, labels, *args, **kwargs)
 
     monkeypatch.setattr(datasets, "plot_latents", plot)
     files = plot_traits(dataset, model, tmp_path)
@@ -96,10 +99,10 @@ def test_evaluation_and_pictures_take_the_episodes_left_out_by_the_model_s_seed(
     windows = load_windows(dataset)
     _, test = split_by_episode(windows, TEST_FRACTION, SEED)
     assert found["windows"] == len(test)
-    ((episode, conservative),) = drawn
+    ((episode, drawn_labels),) = drawn
     labels = load_labels(dataset, windows)[test]
     np.testing.assert_array_equal(episode, windows.episode[test])
-    np.testing.assert_array_equal(conservative, labels == CONSERVATIVE_LABEL)
+    np.testing.assert_array_equal(drawn_labels, labels)
     assert max(labels.mean(), 1 - labels.mean()) - 0.05 <= found["accuracy"] <= 1.0
 
 
@@ -119,6 +122,33 @@ def test_shipped_models_are_small_and_classify_unseen_drivers(
     assert find(name).with_suffix(".safetensors").stat().st_size < 2_000_000
     assert evaluate_traits(dataset, name, noise_m=noise_m)["accuracy"] >= least
     assert read_card(name).entries["accuracy_by_noise"][f"{noise_m:g}"] >= least
+
+
+def test_vtypes_are_traits_from_the_recording_to_the_picture(
+    user_network: Callable[[str], UserNetwork], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The two vTypes of the merge, with a third one that nobody has."""
+    folder = user_network("merge").sumocfg.parent
+    text = (folder / "merge.rou.xml").read_text().replace("</routes>", '<vType id="nobody" length="9"/></routes>')
+    (tmp_path / "three.rou.xml").write_text(text)
+    net, step = str(folder / "merge.net.xml"), '<step-length value="0.1"/>'
+    sumocfg = write_config(tmp_path / "three.sumocfg", net, "three.rou.xml", step)
+    data, model = tmp_path / "data", tmp_path / "model"
+    record_sumocfg(sumocfg, data, 400, progress=False)
+    train_traits(data, model, settings=SMALL, seed=SEED)
+    assert main(["traits", "evaluate", "--data", str(data), "--model", str(model), "--json"]) == 0
+    *page, content = capsys.readouterr().out.splitlines()
+    found = json.loads(content)
+    confusion = found["confusion"]
+    assert list(confusion) == ["calm", "hasty"]
+    sizes = {name: sum(answers.values()) for name, answers in confusion.items()}
+    assert sum(sizes.values()) == found["windows"]
+    assert max(sizes.values()) / found["windows"] == found["majority_share"]
+    right = [confusion[name][name] for name in confusion]
+    assert sum(right) / found["windows"] == pytest.approx(found["accuracy"])
+    assert found["balanced_accuracy"] == pytest.approx(right[0] / sizes["calm"] / 2 + right[1] / sizes["hasty"] / 2)
+    assert sum(line.startswith(("calm ", "hasty ")) for line in page) == 2
+    assert [file.name for file in plot_traits(data, model, tmp_path / "p")] == ["latent.png", "reconstruction.png"]
 
 
 def test_noise_makes_evaluation_harder_and_is_repeatable(dataset: Path) -> None:

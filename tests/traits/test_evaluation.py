@@ -73,7 +73,7 @@ def test_a_part_without_windows_has_no_accuracy(model, separable):
 
 def test_one_trait_alone_cannot_be_evaluated(model, separable):
     windows, conservative = separable
-    with pytest.raises(InputError, match="both traits"):
+    with pytest.raises(InputError, match="drivers of two traits"):
         evaluate(model, windows, np.ones_like(conservative))
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from matplotlib.image import imread
 
-from tint_sumo.config import TraitSettings
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, TraitSettings
 from tint_sumo.traits.figures import plot_latents, plot_reconstructions
 from tint_sumo.traits.vae import Vae
 
@@ -27,7 +27,7 @@ def test_each_trait_has_its_colour_where_its_latents_are(model, street, tmp_path
     windows, _ = street
     fast = encode_speed(windows) > np.median(encode_speed(windows))
     file = tmp_path / "figures" / "latent.png"
-    plot_latents(model, windows, ~fast, file)
+    plot_latents(model, windows, fast.astype(int), {"slow": CONSERVATIVE.rgb, "fast": AGGRESSIVE.rgb}, file)
     image = imread(file)
     height, width = image.shape[:2]
     drawn = image[int(0.1 * height) : int(0.8 * height), : width // 2, :3]  # the latent space without title and legend
@@ -36,6 +36,19 @@ def test_each_trait_has_its_colour_where_its_latents_are(model, street, tmp_path
     fast_at = np.nonzero((red - blue > 0.1) & (red - green > 0.1))[1]
     assert np.percentile(slow_at, 95) < np.percentile(fast_at, 5)
     assert [path.name for path in file.parent.iterdir()] == ["latent.png"]
+
+
+def test_rare_kinds_are_grey_where_there_are_too_many(model, street, tmp_path: Path) -> None:
+    windows, _ = street
+    labels = np.arange(len(windows)) % 12
+    labels[: len(windows) // 2] = 5
+    plot_latents(model, windows, labels, {str(number): (1.0, 0.0, 0.0) for number in range(12)}, tmp_path / "all.png")
+    image = imread(tmp_path / "all.png")
+    height, width = image.shape[:2]
+    red, green, blue = np.moveaxis(image[int(0.1 * height) : int(0.8 * height), : width // 2, :3], 2, 0)
+    is_red, is_grey = (red - green > 0.2).sum(), ((red == green) & (green == blue) & (red > 0.4) & (red < 0.75)).sum()
+    assert is_red > 500
+    assert is_grey > 100
 
 
 def encode_speed(windows) -> np.ndarray:

@@ -1,5 +1,6 @@
 """``tint-sumo traits``."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -29,6 +30,7 @@ _NOISE = optional(
 )
 _NET = optional("FILE", "Network of the scenario (.net.xml); without it no leader beyond the end of a lane is seen.")
 
+_MOST_CONFUSED = 10  # traits in the printed table
 _VTYPES = optional(
     "FILE",
     "Route file, additional file or .sumocfg with the vehicles' vTypes, whose lengths are taken.",
@@ -101,6 +103,7 @@ class EvaluateTraits(Command):
         lines = [
             f"linear SVC         {percent(found['accuracy'], 3):>7}% of {found['windows']} windows",
             f"majority share     {percent(found['majority_share'], 3):>7}% (of always taking the most frequent trait)",
+            f"mean of traits     {percent(found['balanced_accuracy'], 3):>7}% (each trait counts the same)",
             f"nearest neighbours {percent(found['knn_accuracy'], 3):>7}%",
             *(
                 f"  {_part_name(name):16} {percent(part['accuracy'], 3):>7}%"
@@ -110,6 +113,7 @@ class EvaluateTraits(Command):
         ]
         if found["error_m"] is not None:
             lines.append(f"position error     {found['error_m']:8.4f} m (root mean square)")
+        lines += _confusion_lines(found["confusion"])
         return Outcome("\n".join(lines), found)
 
 
@@ -208,3 +212,21 @@ class Traits:
 
 def _part_name(name: str) -> str:
     return name.replace("_", " ") if name[0].isalpha() else f"{name} steps"
+
+
+def _confusion_lines(confusion: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """Return a table of windows: a row for each trait, and the linear classifier's answers in columns."""
+    sizes = {name: sum(answers.values()) for name, answers in confusion.items()}
+    shown = sorted(sizes, key=lambda name: -sizes[name])[:_MOST_CONFUSED]
+    rows = [["", *shown, "right"]]
+    for name in shown:
+        right = percent(confusion[name][name] / sizes[name], 1) + "%" if sizes[name] else "-"
+        rows.append([name, *(f"{confusion[name][answer]:,}" for answer in shown), right])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["", "windows of each trait (rows), and what the linear SVC takes them for (columns)"]
+    for first, *others in rows:
+        cells = (cell.rjust(width) for cell, width in zip(others, widths[1:], strict=True))
+        lines.append("  ".join([first.ljust(widths[0]), *cells]).rstrip())
+    if len(sizes) > len(shown):
+        lines.append(f"{len(sizes) - len(shown)} rarer traits are in --json alone")
+    return lines

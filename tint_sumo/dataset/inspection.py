@@ -27,6 +27,7 @@ from tint_sumo.jobs.table import one_job
 RESOLUTION = 0.01  # m, m/s or s: values are rounded to multiples of it
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _MOST_ROWS = 24  # vTypes in a figure
+_COLOURS_OF_VTYPES = (0, 1, 2, 3, 4, 6, 8, 9)  # of tab10, without brown and grey, which have other meanings
 Colour = tuple[float, float, float]  # red, green and blue, each in [0, 1]
 _KEYS = ["episode", "vehicle"]
 
@@ -119,7 +120,7 @@ def inspect(folder: Path, progress: bool = True) -> Inspection:
         InputError: no dataset there, an unfinished or damaged one, or one of another schema version.
     """
     manifest = read_manifest(folder)
-    traits = {trait: TraitStatistics() for trait in _colours(manifest)}
+    traits = {trait: TraitStatistics() for trait in trait_colours(manifest)}
     episode_s = drivers_per_episode = NOTHING
     for rows in _shards(folder, manifest, progress):
         for trait in traits:
@@ -136,12 +137,12 @@ def inspect(folder: Path, progress: bool = True) -> Inspection:
     return Inspection(manifest, traits, episode_s, drivers_per_episode)
 
 
-def _colours(manifest: Manifest) -> dict[str, Colour]:
-    """Return each trait's colour."""
+def trait_colours(manifest: Manifest) -> dict[str, Colour]:
+    """Return each trait's colour, by the traits' numbers; those of vTypes begin again after some."""
     if manifest.profiles is not None:
         return {profile.name: profile.rgb for profile in manifest.profiles}
-    palette = colormaps["tab10"]
-    return {vtype: palette(number % palette.N)[:3] for number, vtype in enumerate(manifest.traits)}
+    palette = [colormaps["tab10"](number)[:3] for number in _COLOURS_OF_VTYPES]
+    return {vtype: palette[number % len(palette)] for number, vtype in enumerate(manifest.traits)}
 
 
 def _shards(folder: Path, manifest: Manifest, progress: bool) -> Iterator[pd.DataFrame]:
@@ -179,6 +180,7 @@ def report(inspection: Inspection) -> str:
         **{
             f"{trait}, {name}": distribution
             for trait, statistics in inspection.traits.items()
+            if statistics.drivers
             for name, distribution in (
                 ("speed (m/s)", statistics.speed_mps),
                 ("gap to the leader (m)", statistics.gap_m),
@@ -189,7 +191,9 @@ def report(inspection: Inspection) -> str:
     summaries = pd.DataFrame.from_dict(
         {name: distribution.summary() for name, distribution in table.items()}, orient="index"
     )
-    return "\n".join([*lines, "", summaries.to_string(na_rep="")])
+    without = [trait for trait, statistics in inspection.traits.items() if not statistics.drivers]
+    note = [f"no drivers: {', '.join(without)}"] if without else []
+    return "\n".join([*lines, "", summaries.to_string(na_rep=""), *note])
 
 
 def _printed(value: object) -> str:
@@ -251,7 +255,7 @@ def _histograms(inspection: Inspection) -> Figure:
     """Return a figure with the distributions of each profile upon each other."""
     figure = Figure(figsize=(12.0, 4.2), dpi=150, layout="constrained")
     speed, gap, track = figure.subplots(1, 3)
-    colours = _colours(inspection.manifest)
+    colours = trait_colours(inspection.manifest)
     for trait, colour in colours.items():
         statistics = inspection.traits[trait]
         _draw(speed, statistics.speed_mps, colour, width=0.02)

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo import traits
-from tint_sumo.config import CONSERVATIVE_LABEL, LATENT_SIZE, TRAIT_BUDGETS, TraitSettings
+from tint_sumo.config import LATENT_SIZE, TRAIT_BUDGETS, TraitSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Report, silent
+from tint_sumo.dataset.inspection import trait_colours
 from tint_sumo.dataset.schema import read_manifest
 from tint_sumo.dataset.windows import (
     WindowFile,
@@ -111,14 +112,19 @@ def evaluate_traits(
         other_scene: take a model of another scene than the dataset's, too.
 
     Returns:
-        ``model``, ``noise_m`` and the fields of ``TraitAccuracy``.
+        ``model``, ``noise_m`` and the fields of ``Evaluation``, its confusions by the traits' names.
 
     Raises:
         InputError: no usable dataset or model.
     """
     trained, windows, labels, seed = _load_for_test(data, model, noise_m, other_scene)
     found = evaluate(trained, windows, labels, noise_m=noise_m, seed=seed)
-    return {"model": str(model), "noise_m": noise_m, **asdict(found)}
+    names = read_manifest(data).traits
+    confusion = {
+        names[kind]: {names[answer]: count for answer, count in answers.items()}
+        for kind, answers in found.confusion.items()
+    }
+    return {"model": str(model), "noise_m": noise_m, **asdict(found), "confusion": confusion}
 
 
 def plot_traits(
@@ -130,15 +136,11 @@ def plot_traits(
         InputError: no usable dataset or model.
     """
     trained, windows, labels, seed = _load_for_test(data, model, noise_m, other_scene)
-    profiles = read_manifest(data).profiles
-    if profiles is None or len(profiles) > 2:
-        raise InputError(
-            "the picture is of conservative and aggressive drivers, and these are of vTypes or other profiles; "
-            "evaluate instead"
-        )
     _, unseen = split_by_episode(windows, TEST_FRACTION, seed)
     files = [out / "latent.png"]
-    plot_latents(trained, windows[unseen], labels[unseen] == CONSERVATIVE_LABEL, files[0], noise_m=noise_m)
+    plot_latents(
+        trained, windows[unseen], labels[unseen], trait_colours(read_manifest(data)), files[0], noise_m=noise_m
+    )
     if isinstance(trained, Vae):
         files.append(out / "reconstruction.png")
         plot_reconstructions(trained, windows[unseen], files[1])

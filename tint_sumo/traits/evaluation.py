@@ -51,6 +51,14 @@ class TraitAccuracy:
 
 
 @dataclass(frozen=True)
+class Evaluation(TraitAccuracy):
+    """Accuracy, and which traits the linear classifier takes for which."""
+
+    balanced_accuracy: Fraction  # mean over the traits of the share of their windows that it gets right
+    confusion: Mapping[int, Mapping[int, int]]  # windows by label, and by the classifier's answer
+
+
+@dataclass(frozen=True)
 class Latents:
     """Gaussians over the latents of N windows."""
 
@@ -69,7 +77,7 @@ class Probe:
         seed: of the noise and of the neighbours' choice.
 
     Raises:
-        InputError: the windows do not hold both traits.
+        InputError: the windows do not hold two traits.
     """
 
     def __init__(
@@ -83,7 +91,8 @@ class Probe:
     ) -> None:
         if len(np.unique(labels)) < 2:
             raise InputError(
-                "both traits and several episodes are needed to evaluate; record a larger dataset of population traits"
+                "drivers of two traits and several episodes are needed to evaluate; record a larger dataset, of "
+                "population traits or several vTypes"
             )
         self._model, self._noise_m, self._seed = model, noise_m, seed
         mean = encode_windows(model, windows, noise_m=noise_m, seed=seed).mean
@@ -99,13 +108,28 @@ class Probe:
         Raises:
             InputError: there are no windows.
         """
+        return self._score(windows, labels)[0]
+
+    def evaluate(self, windows: Windows, labels: NDArray[np.integer]) -> Evaluation:
+        """Return the accuracy on N windows with all confusions; errors are those of ``score``."""
+        accuracy, answers = self._score(windows, labels)
+        kinds = sorted({*labels.tolist(), *answers.tolist()})
+        confusion = {
+            kind: {answer: int(((labels == kind) & (answers == answer)).sum()) for answer in kinds} for kind in kinds
+        }
+        recalls = [float((answers == kind)[labels == kind].mean()) for kind in np.unique(labels)]
+        return Evaluation(**vars(accuracy), balanced_accuracy=float(np.mean(recalls)), confusion=confusion)
+
+    def _score(self, windows: Windows, labels: NDArray[np.integer]) -> tuple[TraitAccuracy, NDArray[np.integer]]:
+        """Return the accuracy, and the linear classifier's answers, (N,)."""
         if len(windows) == 0:
             raise InputError("there are no windows to evaluate on; record a larger dataset")
         latents = encode_windows(self._model, windows, noise_m=self._noise_m, seed=self._seed + 1)
-        correct = self._linear.predict(latents.mean) == labels
+        answers = self._linear.predict(latents.mean)
+        correct = answers == labels
         nearest = self._nearest.predict(latents.mean) == labels
         length, has_leader = windows.length, windows.has_leader
-        return TraitAccuracy(
+        accuracy = TraitAccuracy(
             accuracy=float(correct.mean()),
             knn_accuracy=float(nearest.mean()),
             majority_share=float(np.unique(labels, return_counts=True)[1].max() / len(labels)),
@@ -118,11 +142,12 @@ class Probe:
             },
             by_leader={"with_leader": _part(correct[has_leader]), "without_leader": _part(correct[~has_leader])},
         )
+        return accuracy, answers
 
 
 def evaluate(
     model: TraitModel, windows: Windows, labels: NDArray[np.integer], *, noise_m: float = 0.0, seed: int = 0
-) -> TraitAccuracy:
+) -> Evaluation:
     """Fit classifiers on two thirds of the episodes and test them on the rest (paper IV-B).
 
     Args:
@@ -133,11 +158,11 @@ def evaluate(
         seed: of the split. Use that of the training, so that the test episodes are unseen by the model too.
 
     Raises:
-        InputError: the training part does not hold both traits, or the test part is empty.
+        InputError: the training part does not hold two traits, or the test part is empty.
     """
     train, test = split_by_episode(windows, TEST_FRACTION, seed)
     probe = Probe(model, windows[train], labels[train], noise_m=noise_m, seed=seed)
-    return probe.score(windows[test], labels[test])
+    return probe.evaluate(windows[test], labels[test])
 
 
 def linear_r2(

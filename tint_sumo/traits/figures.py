@@ -1,5 +1,6 @@
 """Pictures of what trait models have learnt (paper Fig. 3)."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, NO_LEADER_GAP_M, STEP_S, WINDOW_STEPS, VehicleShape
+from tint_sumo.config import NO_LEADER_GAP_M, STEP_S, WINDOW_STEPS, VehicleShape
 from tint_sumo.core.files import whole_file
+from tint_sumo.dataset.inspection import Colour
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.traits.evaluation import encode_windows
 from tint_sumo.traits.model import TraitModel
@@ -20,12 +22,15 @@ DRAWN_WINDOWS = 5000  # more windows would hide each other
 NUMBERED = 10  # windows whose trajectories are shown
 LEADER_COLOUR = (0.55, 0.35, 0.17)
 _RECONSTRUCTED = 6
+_MOST_COLOURS = 8  # as many as vTypes have
+_OTHERS = (0.6, 0.6, 0.6)
 
 
 def plot_latents(
     model: TraitModel,
     windows: Windows,
-    conservative: NDArray[np.bool_],
+    labels: NDArray[np.integer],
+    colours: Mapping[str, Colour],
     file: Path,
     *,
     noise_m: float = 0.0,
@@ -36,22 +41,31 @@ def plot_latents(
     Args:
         model: a trained model with at least two latents.
         windows: N windows, best those of unseen episodes; a random part of them is drawn.
-        conservative: (N,) the label of each window's driver.
+        labels: (N,) the number of each window's trait.
+        colours: of the traits by their names, in the order of their numbers. If too many traits have windows, the rarer
+            ones are grey.
         file: where the PNG goes.
         noise_m: standard deviation of the noise on every position.
         seed: of the part that is drawn, and of the noise.
     """
     chosen = np.random.default_rng(seed).permutation(len(windows))[:DRAWN_WINDOWS]
-    drawn, is_conservative = windows[chosen], conservative[chosen]
+    drawn, kind = windows[chosen], labels[chosen]
     latents = encode_windows(model, drawn, noise_m=noise_m, seed=seed).mean
-    numbered = _numbered(latents, drawn, is_conservative)
+    by_count = sorted(np.unique(kind).tolist(), key=lambda number: -int((kind == number).sum()))
+    shown = sorted(by_count if len(by_count) <= _MOST_COLOURS else by_count[: _MOST_COLOURS - 1])
+    colour = np.array([rgb if number in shown else _OTHERS for number, rgb in enumerate(colours.values())])[kind]
+    numbered = _numbered(latents, drawn, kind, sorted(by_count[:NUMBERED]))
 
     figure = Figure(figsize=(11.0, 5.0), dpi=150, layout="constrained")
     space, street = figure.subplots(1, 2)
-    colours = np.where(is_conservative[:, None], CONSERVATIVE.rgb, AGGRESSIVE.rgb)
-    space.scatter(latents[:, 0], latents[:, 1], s=6, c=colours, alpha=0.35, linewidths=0)
-    for profile, count in ((CONSERVATIVE, is_conservative.sum()), (AGGRESSIVE, (~is_conservative).sum())):
-        space.scatter([], [], s=30, color=profile.rgb, label=f"{profile.name} ({count} windows)")
+    space.scatter(latents[:, 0], latents[:, 1], s=6, c=colour, alpha=0.35, linewidths=0)
+    names = list(colours)
+    for number in shown:
+        count = int((kind == number).sum())
+        space.scatter([], [], s=30, color=colours[names[number]], label=f"{names[number]} ({count} windows)")
+    if others := len(by_count) - len(shown):
+        count = int((~np.isin(kind, shown)).sum())
+        space.scatter([], [], s=30, color=_OTHERS, label=f"{others} others ({count} windows)")
     noise = f", {noise_m:g} m noise" if noise_m else ""
     space.set(xlabel="latent 1", ylabel="latent 2", title=f"Latent space of '{model.method}'{noise}")
     space.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, frameon=False)
@@ -59,7 +73,7 @@ def plot_latents(
     for number, window in enumerate(numbered, start=1):
         box = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "alpha": 0.8, "linewidth": 0.6}
         space.annotate(str(number), latents[window, :2], ha="center", va="center", fontsize=7, bbox=box)
-    _draw_street(street, drawn[numbered], is_conservative[numbered])
+    _draw_street(street, drawn[numbered], colour[numbered])
     _save(figure, file)
 
 
@@ -95,27 +109,28 @@ def plot_reconstructions(model: Vae, windows: Windows, file: Path, *, seed: int 
     _save(figure, file)
 
 
-def _numbered(latents: NDArray[np.float32], windows: Windows, conservative: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return full windows spread evenly over each trait's order along its widest latent direction."""
+def _numbered(
+    latents: NDArray[np.float32], windows: Windows, kind: NDArray[np.integer], kinds: Sequence[int]
+) -> NDArray[np.int64]:
+    """Return full windows spread evenly over the order of each trait in ``kinds`` along its widest latent direction."""
     chosen: list[int] = []
-    for trait in (True, False):
-        mine = np.flatnonzero((conservative == trait) & (windows.length == WINDOW_STEPS))
+    for trait in kinds:
+        mine = np.flatnonzero((kind == trait) & (windows.length == WINDOW_STEPS))
         widest = latents[mine].var(axis=0).argmax() if len(mine) else 0
         ordered = mine[np.argsort(latents[mine, widest], kind="stable")]
-        count = min(NUMBERED // 2, len(ordered))
+        count = min(NUMBERED // len(kinds), len(ordered))
         chosen.extend(ordered[np.linspace(0, len(ordered) - 1, count).round().astype(int)] if count else [])
     return np.array(chosen, np.int64)
 
 
-def _draw_street(axes: Axes, windows: Windows, conservative: NDArray[np.bool_]) -> None:
+def _draw_street(axes: Axes, windows: Windows, colours: NDArray[np.float64]) -> None:
     """Draw a row per window: positions of the driver and of its leader, darker as time goes on."""
     opacity: Any = np.linspace(0.15, 1.0, WINDOW_STEPS)  # matplotlib's type hints know only one for all markers
     for row in range(len(windows)):
         offset, gap = windows.states[row].T
         led = gap < NO_LEADER_GAP_M
-        colour = (CONSERVATIVE if conservative[row] else AGGRESSIVE).rgb
         height = np.full(WINDOW_STEPS, row + 1)
-        axes.scatter(offset, height, marker=">", s=22, color=colour, alpha=opacity, linewidths=0)
+        axes.scatter(offset, height, marker=">", s=22, color=colours[row], alpha=opacity, linewidths=0)
         if led.any():
             ahead = (offset + gap + VehicleShape.length_m)[led]
             axes.scatter(ahead, height[led], marker=">", s=22, color=LEADER_COLOUR, alpha=opacity[led], linewidths=0)

@@ -252,6 +252,23 @@ def test_demand_that_sumo_refuses_is_an_error_in_one_line(user_network: Make) ->
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("backend", ["libsumo", "traci"])
+def test_a_fault_that_sumo_finds_while_it_runs_is_an_error_in_one_line(backend: Backend, user_network: Make) -> None:
+    network = user_network("merge")
+    text = network.sumocfg.read_text().replace("</configuration>", '<lateral-resolution value="0.8"/></configuration>')
+    (network.sumocfg.parent / "sublane.sumocfg").write_text(text)
+    routes = (network.sumocfg.parent / "merge.rou.xml").read_text()
+    (network.sumocfg.parent / "sublane.rou.xml").write_text(
+        routes.replace('id="calm"', 'id="calm" laneChangeModel="LC2013"')
+    )
+    sumocfg = network.sumocfg.parent / "sublane.sumocfg"
+    sumocfg.write_text(sumocfg.read_text().replace("merge.rou.xml", "sublane.rou.xml"))
+    scene = replace(network, sumocfg=sumocfg).scene()
+    with pytest.raises(InputError, match=r"SUMO does not run .*sublane\.sumocfg") as caught, begun(scene, 1, backend):
+        pass
+    assert "\n" not in str(caught.value)
+
+
 def test_output_files_of_the_configuration_are_not_written(user_network: Make) -> None:
     network = user_network("merge")
     folder = network.sumocfg.parent

@@ -21,7 +21,7 @@ from tint_sumo.dataset.windows import count_windows
 from tint_sumo.scenes.geometry import NO_VEHICLE
 from tint_sumo.scenes.sumocfg import SumoConfig, read_config, read_net, read_vtypes
 from tint_sumo.simulation.connection import Connection, connect
-from tint_sumo.simulation.sumocfg import Kinds, leader_of, refusals, sumo_options
+from tint_sumo.simulation.sumocfg import Kinds, Refusals, leader_of, sumo_options
 
 EPISODES_PER_SHARD = 4
 
@@ -94,7 +94,7 @@ class _Row(NamedTuple):
 def _simulate_episode(recording: SumocfgRecording, episode: int) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return rows of trajectories, by vehicle and time, and of drivers."""
     config = recording.config
-    with refusals(config):
+    with Refusals(config):
         connection = connect(sumo_options(config, [recording.seed, episode], STEP_S))
         try:
             watch = _Watch(connection, Kinds(config, recording.vtypes, connection))

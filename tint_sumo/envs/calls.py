@@ -69,6 +69,8 @@ def checked_actions(actions: Any, shape: tuple[int, ...], choices: int) -> NDArr
     Raises:
         InputError: they are no such integers, out of range, or as many as there are not.
     """
+    if not shape and (type(actions) is int or isinstance(actions, np.integer)) and 0 <= actions < choices:
+        return np.asarray(actions)  # the usual case of a single environment, whose steps are short
     array = _as_array(actions)
     if (
         array.dtype.kind not in "iu"

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import libsumo
 from sumolib.miscutils import getFreeSocketPort
 from traci import main as traci  # with LIBSUMO_AS_TRACI the package itself is libsumo under another name
-from traci.exceptions import FatalTraCIError
+from traci.exceptions import FatalTraCIError, TraCIException
 
 from tint_sumo.config import Backend
 from tint_sumo.core.errors import InputError
@@ -27,6 +27,7 @@ from tint_sumo.scenes.network import sumo_program
 
 _CONNECT_TRIES, _CONNECT_WAIT_S = 600, 0.05  # sumo takes a moment to listen
 LOAD_STATE = "--load-state"
+SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError, TraCIException, FatalTraCIError)
 _SIMULATION_OPTIONS = ("--net-file", "--configuration-file", "--seed")  # in which simulations differ
 
 

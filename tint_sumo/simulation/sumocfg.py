@@ -6,15 +6,12 @@ around the ego are asked for with a context subscription, at the same cost howev
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import libsumo
 import numpy as np
 from libsumo import constants
-from traci.exceptions import FatalTraCIError, TraCIException
 
 from tint_sumo.config import NO_LEADER_GAP_M, Backend
 from tint_sumo.core.errors import InputError
@@ -22,7 +19,7 @@ from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import BUILDING, Building, View
 from tint_sumo.scenes.sumocfg import DEFAULT_VTYPE, SumocfgScene, SumoConfig, network_roads
-from tint_sumo.simulation.connection import Connection, connect
+from tint_sumo.simulation.connection import SUMO_ERRORS, Connection, connect
 from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.simulation.sumo import NO_COLLISION_CHECK, SPEED_MODE_OBEY_SETSPEED
 from tint_sumo.simulation.warm_starts import WarmStarts
@@ -95,24 +92,33 @@ def sumo_options(config: SumoConfig, seed: int | Sequence[int], step_s: float | 
     ]
 
 
-@contextmanager
-def refusals(config: SumoConfig) -> Iterator[None]:
-    """Raise InputError, one line, where SUMO finds fault with the configuration."""
-    try:
-        yield
-    except (libsumo.TraCIException, TraCIException, FatalTraCIError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"SUMO does not run {config.file} ({reason}); try it with: sumo -c {config.file}") from None
+@dataclass(frozen=True)
+class Refusals:
+    """Raises InputError, one line, where SUMO finds fault with the configuration in a ``with`` block.
+
+    A class, since a step of a few vehicles would notice the time that a generator takes.
+    """
+
+    config: SumoConfig
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if isinstance(error, SUMO_ERRORS):
+            reason = " ".join(str(error).split())
+            file = self.config.file
+            raise InputError(f"SUMO does not run {file} ({reason}); try it with: sumo -c {file}") from None
 
 
-def _write_box(box: Any, sight: Sight, origin_m: tuple[float, float]) -> None:
-    """Write centre and heading of a vehicle's box, one record; SUMO gives its front, and its angle from north."""
+def _box(sight: Sight, size_m: tuple[float, float], origin_m: tuple[float, float]) -> tuple[float, ...]:
+    """Return a vehicle's box, a record; SUMO gives its front, and its angle from north."""
     x_m, y_m = sight[constants.VAR_POSITION]
     angle_rad = math.radians(sight[constants.VAR_ANGLE])  # clockwise
     heading_x, heading_y = math.sin(angle_rad), math.cos(angle_rad)
-    half_m = box["length_m"] / 2
-    box["x_m"], box["y_m"] = x_m - half_m * heading_x - origin_m[0], y_m - half_m * heading_y - origin_m[1]
-    box["heading_x"], box["heading_y"] = heading_x, heading_y
+    half_m = size_m[0] / 2
+    x_m, y_m = x_m - half_m * heading_x - origin_m[0], y_m - half_m * heading_y - origin_m[1]
+    return (x_m, y_m, heading_x, heading_y, *size_m)
 
 
 class SumocfgSimulation(Simulation):
@@ -134,8 +140,10 @@ class SumocfgSimulation(Simulation):
             )
         super().__init__(replicas, scene)
         self.trait_of_member = np.arange(len(scene.vtypes))
+        self._refusals = Refusals(scene.config)
+        self._ego_size_m = (scene.vehicle.length_m, scene.vehicle.width_m)
         self.passed_m = np.array([np.inf])  # no vehicle's way is ever left behind
-        with refusals(scene.config):
+        with self._refusals:
             self.connection = connect(sumo_options(scene.config, seed=0), backend)
         self.warm_starts = WarmStarts(scene, self.connection, partial(sumo_options, scene.config))
         self._kinds = Kinds(scene.config, scene.vtypes, self.connection)
@@ -164,16 +172,15 @@ class SumocfgSimulation(Simulation):
             InputError: SUMO refuses the configuration, or other vehicles leave the ego no room at its start.
         """
         self.clear(replica)
-        with refusals(self.scene.config):
+        with self._refusals:
             self.warm_starts.begin(seed)
             self._define_ego()
             self._let_ego_enter()
             self.connection.vehicle.subscribeContext(EGO, constants.CMD_GET_VEHICLE_VARIABLE, self.scene.sight_m, _SEEN)
             sight = self.connection.vehicle.getContextSubscriptionResults(EGO)[EGO]
         self._drives = True
-        ego = self.egos.box[0]
-        _write_box(ego, sight, (0.0, 0.0))
-        self.origin_m = (float(ego["x_m"]), float(ego["y_m"]))
+        x_m, y_m, *_ = _box(sight, self._ego_size_m, (0.0, 0.0))
+        self.origin_m = (x_m, y_m)
         self._build(self._find_buildings())
         self._look()
 
@@ -232,7 +239,7 @@ class SumocfgSimulation(Simulation):
         if not self._drives:
             return
         self.egos.drive(desired_speed_mps)
-        with refusals(self.scene.config):
+        with self._refusals:
             self.connection.vehicle.setSpeed(EGO, float(self.egos.speed_mps[0]))
             self.connection.step()
         self._look()
@@ -248,14 +255,17 @@ class SumocfgSimulation(Simulation):
             return
         self.egos.front_m[0] = self.scene.start_m + ego[constants.VAR_DISTANCE]
         self.egos.speed_mps[0] = ego[constants.VAR_SPEED]
-        _write_box(self.egos.box[0], ego, self.origin_m)
-        front_m = ego[constants.VAR_POSITION]
-        nearest = sorted(seen, key=lambda vehicle_id: math.dist(seen[vehicle_id][constants.VAR_POSITION], front_m))
-        self._follow({vehicle_id: seen[vehicle_id] for vehicle_id in nearest[: self.scene.max_vehicles]})
+        self.egos.box[0] = _box(ego, self._ego_size_m, self.origin_m)
+        self._follow(seen if seen.keys() <= self.slot.keys() else self._nearest(seen, ego[constants.VAR_POSITION]))
         self._look_around()
 
+    def _nearest(self, seen: Mapping[str, Sight], front_m: tuple[float, float]) -> dict[str, Sight]:
+        """Return as many vehicles as there are slots, nearest first."""
+        nearest = sorted(seen, key=lambda vehicle_id: math.dist(seen[vehicle_id][constants.VAR_POSITION], front_m))
+        return {vehicle_id: seen[vehicle_id] for vehicle_id in nearest[: self.scene.max_vehicles]}
+
     def _follow(self, near: Mapping[str, Sight]) -> None:
-        """Take over where the nearest vehicles are, nearest first and no more than there are slots."""
+        """Take over where vehicles are: those that have slots, or the nearest of all, nearest first."""
         slots = self.slots
         slots.begin_step()
         for vehicle_id in self.slot.keys() - near.keys():
@@ -263,8 +273,9 @@ class SumocfgSimulation(Simulation):
         for vehicle_id, sight in near.items():
             slot = self.slot[vehicle_id] if vehicle_id in self.slot else self._take(vehicle_id)
             if slot != NO_VEHICLE:
+                size_m = slots.length_m.item(0, slot), slots.width_m.item(0, slot)
                 slots.front_m[0, slot] = sight[constants.VAR_DISTANCE]
-                _write_box(slots.box[0, slot], sight, self.origin_m)
+                slots.box[0, slot] = _box(sight, size_m, self.origin_m)
 
     def _take(self, vehicle_id: str) -> int:
         """Return the slot that a vehicle takes; ``NO_VEHICLE`` if none is free."""

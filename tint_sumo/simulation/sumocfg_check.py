@@ -15,7 +15,7 @@ from tint_sumo.core.reading import TABLE_BYTES, open_file, unpacked
 from tint_sumo.scenes.ego_routes import EgoRoute, Turn, suggest_routes
 from tint_sumo.scenes.sumocfg import EGO_CLASS, SumocfgScene, SumoConfig, read_config, read_net, read_vtypes
 from tint_sumo.simulation.connection import connect
-from tint_sumo.simulation.sumocfg import refusals, sumo_options
+from tint_sumo.simulation.sumocfg import Refusals, sumo_options
 from tint_sumo.simulation.vtypes import VType, find_vtype, read_vtype_table
 
 WATCHED_S = 100.0  # so much traffic is looked at
@@ -142,7 +142,7 @@ def _watch(config: SumoConfig) -> Traffic:
     vehicles: Counter[str] = Counter()
     turns: Counter[Turn] = Counter()
     persons = most_at_once = teleports = 0
-    with refusals(config):
+    with Refusals(config):
         connection = connect(sumo_options(config, seed=0))
         try:
             simulation, vehicle = connection.simulation, connection.vehicle

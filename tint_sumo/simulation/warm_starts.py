@@ -15,13 +15,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import libsumo
 import numpy as np
-from traci.exceptions import FatalTraCIError, TraCIException
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.sumocfg import SumocfgScene
-from tint_sumo.simulation.connection import LOAD_STATE, Connection
+from tint_sumo.simulation.connection import LOAD_STATE, SUMO_ERRORS, Connection
 
 _CHOICE, _STATE = 2, 3  # what is drawn from a seed: the number of a state; and from the number of a state: its traffic
 _SAME_M = 0.01  # vehicles and persons of a loaded state are at most so far from where they were
@@ -116,7 +114,7 @@ def _are_same(saved: _Positions, loaded: _Positions) -> bool:
 def _refusals(scene: SumocfgScene) -> Iterator[None]:
     try:
         yield
-    except (libsumo.TraCIException, TraCIException, FatalTraCIError) as error:
+    except SUMO_ERRORS as error:
         reason = " ".join(str(error).split())
         raise InputError(
             f"SUMO does not load a state of {scene.config.file} that it has saved itself ({reason}); "

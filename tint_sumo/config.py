@@ -24,8 +24,8 @@ P_CONSERVATIVE = (0.25, 0.4, 0.6)  # driver mixes of the paper's experiments (pa
 
 SNAPSHOTS_PERCENT = (25, 50)  # parts of a training after which the policy is kept, too
 
-MOST_LABELS = 127  # labels are numbers of one byte
-MOST_ACTIONS = 100  # so are actions
+MOST_LABELS = 2**15 - 1  # labels are numbers of two bytes
+MOST_ACTIONS = 100  # actions are numbers of one byte
 MOST_VTYPES = 10_000  # in a simulation
 MOST_DECISIONS = 2**22  # of a batch of PPO
 
@@ -142,7 +142,7 @@ class Population:
     def __post_init__(self) -> None:
         names = [profile.name for profile in self.profiles]
         if not 1 <= len(names) <= MOST_LABELS:
-            raise InputError(f"profiles must be 1 to {MOST_LABELS}, not {len(names)}")
+            raise InputError(f"profiles must be 1 to {MOST_LABELS:,}, not {len(names)}")
         if len(set(names)) < len(names):
             raise InputError(f"profiles must have names of their own, not {', '.join(names)}")
         require_ranges(self)

@@ -71,7 +71,8 @@ def test_what_is_seen_of_the_t_intersection_is_that_of_its_version(noise_m: floa
         for _ in range(250):
             seen = (
                 *(observation[key] for key in ("ego", "vehicles", "mask")),
-                *(infos[key] for key in ("traits", *TRACKS)),
+                infos["traits"].astype(np.int8),  # labels had one byte in the beginning
+                *(infos[key] for key in TRACKS),
             )
             for values in seen:
                 found.update(np.ascontiguousarray(values).tobytes())

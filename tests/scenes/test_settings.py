@@ -152,7 +152,7 @@ def test_wrong_profiles(wrong: dict[str, Any], message: str) -> None:
 
 
 def test_wrong_populations() -> None:
-    for profiles, message in (((), "profiles must be 1 to 127, not 0"), ((CONSERVATIVE,) * 2, "names of their own")):
+    for profiles, message in (((), "profiles must be 1 to 32,767, not 0"), ((CONSERVATIVE,) * 2, "names of their own")):
         with pytest.raises(InputError, match=message):
             Population(profiles)
     with pytest.raises(InputError, match="population: profiles must have names of their own, not shy, shy"):

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.scenes.networks import USER_NETWORKS, UserNetwork, write_config
-from tint_sumo.config import MOST_LABELS
+from tests.scenes.networks import USER_NETWORKS, UserNetwork
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SumocfgScene
 from tint_sumo.scenes.network import sumo_program
-from tint_sumo.scenes.sumocfg import NET_VERSION, read_config, read_net, read_vtypes
+from tint_sumo.scenes.sumo_config import read_config
+from tint_sumo.scenes.sumocfg import NET_VERSION, read_net
 
 Make = Callable[[str], UserNetwork]
 
@@ -68,7 +68,7 @@ def test_long_steps_do_not_make_the_ego_overshoot(user_network: Make) -> None:
         ({"max_vehicles": 0}, "max_vehicles must lie in 1 to 200"),
         ({"sight_m": float("nan")}, "sight_m must lie in 0 to 1000"),
         ({"warm_up_s": -1.0}, "warm_up_s must lie in"),
-        ({"warm_starts": -1}, "warm_starts must lie in 0 to 1000"),
+        ({"warm_starts": -1}, "warm_starts must lie in 0 to 1,000"),
     ],
 )
 def test_bad_tasks_are_refused(changes: dict[str, object], message: str, merge: UserNetwork) -> None:
@@ -121,30 +121,6 @@ def test_the_known_version_is_that_of_this_sumo(tmp_path: Path) -> None:
     file = tmp_path / "net.xml"
     subprocess.run([sumo_program("netgenerate"), "--grid", "-o", str(file)], check=True, capture_output=True)
     assert tuple(map(int, read_net(file).getVersion())) == NET_VERSION
-
-
-def test_too_many_vtypes_are_refused(merge: UserNetwork) -> None:
-    lines = "".join(f'<vType id="{number}"/>' for number in range(MOST_LABELS + 1))
-    (merge.sumocfg.parent / "merge.rou.xml").write_text(f"<routes>{lines}</routes>")
-    with pytest.raises(InputError, match="128 vTypes; at most 127"):
-        read_vtypes(read_config(merge.sumocfg))
-
-
-def test_configurations_are_read_in_all_their_forms(merge: UserNetwork) -> None:
-    folder = merge.sumocfg.parent
-    short = folder / "short.sumocfg"
-    short.write_text(
-        '<configuration><n v="merge.net.xml"/><r v="merge.rou.xml, "/><step-length v="0:0:0.5"/></configuration>'
-    )
-    found = read_config(short)
-    assert found.files == (short, folder / "merge.net.xml", folder / "merge.rou.xml")
-    assert found.step_s == 0.5
-    output = write_config(folder / "o.sumocfg", "merge.net.xml", "merge.rou.xml", '<tripinfo-output value="t.xml"/>')
-    assert read_config(output).outputs == ("tripinfo-output",)
-    with pytest.raises(InputError, match="names no net-file"):
-        read_config(write_config(folder / "x.sumocfg", "", "merge.rou.xml"))
-    with pytest.raises(InputError, match="step-length 'soon'"):
-        read_config(write_config(folder / "x.sumocfg", "merge.net.xml", "", '<step-length value="soon"/>'))
 
 
 def test_defaults_are_those_of_the_built_in_scenes() -> None:

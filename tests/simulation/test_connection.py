@@ -13,8 +13,9 @@ from traci.storage import Storage
 from tests.scenes.networks import UserNetwork
 from tests.simulation.scenes import T
 from tint_sumo.core.errors import InputError
+from tint_sumo.scenes.sumo_run import SumocfgRun
 from tint_sumo.simulation import SceneSimulation
-from tint_sumo.simulation.sumocfg import SumocfgSimulation, sumo_options
+from tint_sumo.simulation.sumocfg import SumocfgSimulation
 
 
 def test_a_second_simulation_in_the_process_takes_traci_and_libsumo_comes_back() -> None:
@@ -50,7 +51,7 @@ def start_as_user(user_network: Callable[[str], UserNetwork]) -> Iterator[Callab
     """Start a simulation in libsumo as the user's own program does, and step it once."""
 
     def start() -> None:
-        libsumo.start(["sumo", *sumo_options(user_network("merge").scene().config, seed=5)])
+        libsumo.start(["sumo", *SumocfgRun(user_network("merge").scene().config).options(seed=5)])
         libsumo.simulationStep(10.0)
 
     yield start

@@ -245,11 +245,30 @@ def test_demand_that_sumo_refuses_is_an_error_in_one_line(user_network: Make) ->
         '<routes><vehicle id="wrong" depart="0"><route edges="nowhere"/></vehicle></routes>'
     )
     sumocfg = write_config(folder / "wrong.sumocfg", "merge.net.xml", "wrong.rou.xml")
-    scene = UserNetwork(sumocfg, network.ego_route, 20.0, 100.0).scene()
-    for backend in ("libsumo", "traci"):
-        with pytest.raises(InputError, match=r"SUMO does not run .*wrong\.sumocfg") as caught:
-            SumocfgSimulation(1, scene, backend=backend)
-        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=r"SUMO does not run .*wrong\.sumocfg \(The edge 'nowhere' within") as caught:
+        UserNetwork(sumocfg, network.ego_route, 20.0, 100.0).scene()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("backend", ["libsumo", "traci"])
+def test_demand_that_sumo_refuses_in_an_episode_is_an_error_in_one_line(backend: Backend, user_network: Make) -> None:
+    network = user_network("merge")
+    folder = network.sumocfg.parent
+    (folder / "later.rou.xml").write_text(
+        '<routes><vehicle id="early" depart="0"><route edges="in out"/></vehicle>'
+        '<trip id="wrong" depart="25" from="out" to="ramp"/></routes>'
+    )
+    more = '<step-length value="0.1"/><route-steps value="5"/>'
+    sumocfg = write_config(folder / "later.sumocfg", "merge.net.xml", "later.rou.xml", more)
+    with (
+        begun(UserNetwork(sumocfg, network.ego_route, 20.0, 100.0).scene(), backend=backend) as simulation,
+        pytest.raises(
+            InputError, match=r"SUMO does not run .*later\.sumocfg \((.*'wrong'|Connection closed)"
+        ) as caught,
+    ):
+        for _ in drive(simulation, 100, desired_mps=0.0):
+            pass
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("backend", ["libsumo", "traci"])

@@ -136,11 +136,11 @@ def test_states_lie_in_a_folder_that_is_removed(
     with simulating(user_network("merge").scene(warm_starts=3)) as simulation:
         for seed in range(20):
             simulation.reset(0, seed)
-        assert len(list(tmp_path.glob("*/*.xml"))) == 3
+        assert len(list(tmp_path.rglob("*.xml"))) == 3
     assert not list(tmp_path.iterdir())
     with simulating(user_network("merge").scene()) as simulation:
         simulation.reset(0, 1)
-        assert not list(tmp_path.iterdir())
+        assert not list(tmp_path.rglob("*.xml"))
 
 
 def test_a_state_that_sumo_does_not_load_as_it_was_saved_is_not_used(mixed: UserNetwork) -> None:

@@ -60,7 +60,7 @@ TRAJECTORY_SCHEMA = pa.schema(
 DRIVER_SCHEMA = pa.schema(
     [
         *_KEYS,
-        _field("trait", pa.dictionary(pa.int8(), pa.string()), "1", "the label: conservative or aggressive"),
+        _field("trait", pa.dictionary(pa.int16(), pa.string()), "1", "the label: conservative or aggressive"),
         _field("vtype", pa.string(), "1", "SUMO vType"),
         _field("desired_speed_mps", pa.float32(), "m/s", "IDM v0"),
         _field("min_gap_m", pa.float32(), "m", "IDM minGap"),

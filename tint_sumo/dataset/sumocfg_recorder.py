@@ -6,6 +6,7 @@ leaders that SUMO's drivers see; ``route`` is empty.
 """
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -19,9 +20,12 @@ from tint_sumo.dataset.schema import SCHEMA_VERSION, Manifest
 from tint_sumo.dataset.shards import EPISODE_STEPS, record_dataset, require_sizes
 from tint_sumo.dataset.windows import count_windows
 from tint_sumo.scenes.geometry import NO_VEHICLE
-from tint_sumo.scenes.sumocfg import SumoConfig, read_config, read_net, read_vtypes
+from tint_sumo.scenes.sumo_config import SumoConfig, read_config, read_vtypes
+from tint_sumo.scenes.sumo_run import SumocfgRun, require_loads
+from tint_sumo.scenes.sumocfg import read_net
 from tint_sumo.simulation.connection import Connection, connect
-from tint_sumo.simulation.sumocfg import Kinds, Refusals, leader_of, sumo_options
+from tint_sumo.simulation.refusals import Refusals
+from tint_sumo.simulation.sumocfg import Kinds, leader_of
 
 EPISODES_PER_SHARD = 4
 
@@ -76,6 +80,7 @@ def record_sumocfg(
     require_sizes(windows, seed)
     config = read_config(sumocfg)
     read_net(config.net_file, with_internal=False)
+    require_loads(config)
     recording = SumocfgRecording(config, read_vtypes(config), windows, seed)
     return record_dataset(out, recording, workers=workers, progress=progress)
 
@@ -94,10 +99,10 @@ class _Row(NamedTuple):
 def _simulate_episode(recording: SumocfgRecording, episode: int) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return rows of trajectories, by vehicle and time, and of drivers."""
     config = recording.config
-    with Refusals(config):
-        connection = connect(sumo_options(config, [recording.seed, episode], STEP_S))
+    with Refusals(config), closing(SumocfgRun(config)) as run:
+        connection = connect(run.options([recording.seed, episode], STEP_S))
         try:
-            watch = _Watch(connection, Kinds(config, recording.vtypes, connection))
+            watch = _Watch(config, recording.vtypes, connection)
             for step in range(EPISODE_STEPS + 1):
                 if step > 0:
                     connection.step()
@@ -113,9 +118,10 @@ class _Watch:
     One that SUMO takes off the road and puts back elsewhere appears anew.
     """
 
-    def __init__(self, connection: Connection, kinds: Kinds) -> None:
+    def __init__(self, config: SumoConfig, vtypes: tuple[str, ...], connection: Connection) -> None:
         self._connection = connection
-        self._kinds = kinds
+        self._vtypes = vtypes
+        self._kinds = Kinds(config, vtypes, connection)
         self._rows: list[_Row] = []
         self._drivers: list[Mapping[str, Any]] = []
         self._numbers: dict[str, int] = {}  # numbers of the vehicles on the road
@@ -140,12 +146,11 @@ class _Watch:
     def _meet(self, vehicle_id: str) -> int:
         vehicle, kind = self._connection.vehicle, self._kinds.of(vehicle_id)
         number = len(self._drivers)
-        vtype = vehicle.getTypeID(vehicle_id)
         self._drivers.append(
             {
                 "vehicle": number,
-                "trait": vtype,
-                "vtype": vtype,
+                "trait": self._vtypes[kind.member],
+                "vtype": vehicle.getTypeID(vehicle_id),
                 "desired_speed_mps": vehicle.getMaxSpeed(vehicle_id) * vehicle.getSpeedFactor(vehicle_id),
                 "min_gap_m": kind.min_gap_m,
                 "tau_s": kind.tau_s,

@@ -190,7 +190,7 @@ class Episodes:
         self.simulation = make_simulation(num_envs, scene, settings.backend)
         self.rows = np.zeros(num_envs, row_type(scene.max_vehicles)) if rows is None else rows
         traits = (*self.simulation.trait_of_member, NO_VEHICLE)  # the last one stands for empty slots
-        self._trait_of_member = np.array(traits, np.int8)
+        self._trait_of_member = np.array(traits, np.int16)
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
         self._scales = Scales(POSITION_SCALE_M, scene.speed_scale_mps, scene.step_s)
         self._speeds_mps = np.array(scene.ego.controller.desired_speeds_mps)

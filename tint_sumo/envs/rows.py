@@ -35,7 +35,7 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
             ("ego", np.float32, (4,)),
             ("vehicles", np.float32, (max_vehicles, 2)),
             ("mask", np.float32, slots),
-            ("traits", np.int8, slots),  # number of the driver's profile, or NO_VEHICLE
+            ("traits", np.int16, slots),  # number of the driver's profile, or NO_VEHICLE
             ("track", np.int64, slots),  # number of the track in the episode, or NO_VEHICLE
             ("slot", np.int64, slots),  # the simulation's slot of the vehicle that is shown, or NO_VEHICLE
             ("position_m", np.float64, slots),  # along the route, as observed; 0 in empty slots
@@ -43,7 +43,7 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
             ("passed", np.int8, slots),  # 1 where the ego has left the vehicle's route behind
             ("true_mask", np.int8, slots),  # of the simulation's slots, as they are: 1 where there is a vehicle
             ("true_vehicles", np.float32, (max_vehicles, 2)),
-            ("true_traits", np.int8, slots),
+            ("true_traits", np.int16, slots),
             ("time_s", np.float64),
             ("outcome", np.int64),
             ("terminated", np.bool_),
@@ -197,7 +197,7 @@ def observe(
     speed_mps: Floats,
     source: Numbers,
     vehicles: Boxes,
-    traits: NDArray[np.int8],
+    traits: NDArray[np.int16],
     track: Numbers,
     noise_m: Floats,
     steps: Numbers,
@@ -237,7 +237,7 @@ def observe(
 
 
 @compiled
-def reveal(egos: Boxes, present: Bools, vehicles: Boxes, traits: NDArray[np.int8], scales: Scales, rows: Rows) -> None:
+def reveal(egos: Boxes, present: Bools, vehicles: Boxes, traits: NDArray[np.int16], scales: Scales, rows: Rows) -> None:
     """Write which vehicles there are and where, seen or not, in the units of observations.
 
     Args:

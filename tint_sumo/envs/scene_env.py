@@ -71,7 +71,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     ## Information
     | Key            | Content                                                                                     |
     |----------------|---------------------------------------------------------------------------------------------|
-    | `traits`       | `(V,)` int8, true traits: number of the driver's profile, 0 conservative and 1 aggressive;  |
+    | `traits`       | `(V,)` int16, true traits: number of the driver's profile, 0 conservative and 1 aggressive;  |
     |                | -1 in empty slots                                                                           |
     | `position_m`   | with `tracks`: `(V,)` where each vehicle's front is seen on its route; 0 in empty slots     |
     | `gap_m`        | with `tracks`: `(V,)` the gap that is seen to the next vehicle ahead; infinite without one  |

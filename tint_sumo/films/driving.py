@@ -80,7 +80,7 @@ class _Recorder:
     def __init__(self, contender: Contender) -> None:
         self._policy = contender.policy
         inner: Any = getattr(contender.policy, "policy", contender.policy)  # a Stable-Baselines3 model holds its policy
-        self._observed: NDArray[np.int8] = np.zeros(0, np.int8)  # true traits of the observation's slots
+        self._observed: NDArray[np.int16] = np.zeros(0, np.int16)  # true traits of the observation's slots
         self._network = inner if isinstance(inner, GruPolicy) else None
         self._desired_mps: float | None = None
         self._value: float | None = None

@@ -4,24 +4,19 @@ The drivers are those of the configuration, and so are the rules by which they m
 learn their traits takes their vTypes for labels.
 """
 
-import gzip
-import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Self
-from xml.etree import ElementTree
 from xml.sax import SAXException
 
 import shapely
 import sumolib
-from sumolib.miscutils import parseTime
 
 from tint_sumo.config import (
-    MOST_LABELS,
     SPEED_SCALE_MPS,
     DistanceM,
     EgoController,
@@ -36,46 +31,13 @@ from tint_sumo.core.ranges import require_ranges
 from tint_sumo.core.reading import TABLE_BYTES, require_file
 from tint_sumo.scenes.roads import Roads, paved_areas
 from tint_sumo.scenes.scene import EgoTask
+from tint_sumo.scenes.sumo_config import SumoConfig, read_config, read_vtypes
+from tint_sumo.scenes.sumo_run import require_loads
 
 NET_VERSION = (1, 20)  # the version that this SUMO's netconvert writes into networks
-DEFAULT_VTYPE = "DEFAULT_VEHTYPE"  # SUMO's type for vehicles that name none
 EGO_CLASS = "passenger"
 _COLOURS = ((40, 90, 200), (200, 40, 40), (30, 140, 70), (130, 60, 170), (220, 110, 20), (20, 150, 170), (90, 90, 90))
 _SEAM_M = 0.06  # half of the line between two lanes
-_DEFAULT_STEP_S = 1.0  # SUMO's
-# Each of these options and SUMO's other names for it.
-_NET, _ROUTES = ("net-file", "net", "n"), ("route-files", "routes", "r")
-_ADDITIONAL = ("additional-files", "additional", "a")
-_OUTPUTS = ("netstate-dump", "netstate", "log", "message-log", "error-log")  # and all options that end with -output
-
-
-@dataclass(frozen=True)
-class SumoConfig:
-    """The options of a .sumocfg that are needed outside of SUMO; paths are absolute."""
-
-    file: Path
-    net_file: Path
-    demand_files: tuple[Path, ...]  # routes and additional files
-    step_s: float
-    outputs: tuple[str, ...]  # options that would write files
-
-    @property
-    def name(self) -> str:
-        return self.file.name.removesuffix(".sumocfg")
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """All files that the simulation follows from."""
-        return (self.file, self.net_file, *self.demand_files)
-
-    @property
-    def digest(self) -> str:
-        """Digest of the configuration's input."""
-        whole = hashlib.sha256()
-        for file in self.files:
-            with file.open("rb") as content:
-                whole.update(hashlib.file_digest(content, "sha256").digest())
-        return whole.hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -197,6 +159,7 @@ def from_sumocfg(
     """
     config = read_config(Path(sumocfg))
     net = read_net(config.net_file)
+    require_loads(config)
     edge_start_m, spans_m, length_m = measure_route(net, tuple(ego_route))
     if not 0.0 <= start_m < goal_m <= length_m:
         raise InputError(
@@ -224,90 +187,6 @@ def from_sumocfg(
     )
 
 
-def read_config(file: Path) -> SumoConfig:
-    """Return what is needed of a SUMO configuration.
-
-    Raises:
-        InputError: there is none, it is damaged, or files that it names are missing.
-    """
-    file = file.resolve()
-    options = {}
-    for element in _elements(file, "SUMO configuration"):
-        value = element.get("value", element.get("v"))
-        if value is not None:
-            options[element.tag] = value
-    net_files, *demand = (_files(file, options, names) for names in (_NET, _ADDITIONAL, _ROUTES))
-    if len(net_files) != 1:
-        raise InputError(f"{file} names no net-file; give a .sumocfg with one")
-    return SumoConfig(
-        file=file,
-        net_file=net_files[0],
-        demand_files=tuple(file for files in demand for file in files),
-        step_s=_seconds(options.get("step-length", str(_DEFAULT_STEP_S)), file),
-        outputs=tuple(name for name in options if name.endswith("-output") or name in _OUTPUTS),
-    )
-
-
-def _files(config: Path, options: dict[str, str], names: tuple[str, ...]) -> list[Path]:
-    """Return the files of an option, whose paths begin at the configuration's folder."""
-    value = next((options[name] for name in names if name in options), "")
-    files = [config.parent / part.strip() for part in value.split(",") if part.strip()]
-    for file in files:
-        if not file.is_file():
-            raise InputError(f"{config} names {names[0]} {file}, and there is no such file; correct the path")
-    return files
-
-
-def _seconds(text: str, file: Path) -> float:
-    """Return a step length that SUMO reads, in seconds or as hours:minutes:seconds."""
-    try:
-        step_s = float(parseTime(text) or math.nan)
-    except ValueError:
-        step_s = math.nan
-    if not 0.001 <= step_s <= 10.0:  # SUMO's shortest
-        raise InputError(f"{file} has step-length {text!r}; give a number of seconds from 0.001 to 10, such as 0.1")
-    return step_s
-
-
-def _elements(file: Path, what: str) -> Iterator[Any]:
-    """Yield all elements of an XML file, each of which is then dropped.
-
-    Raises:
-        InputError: there is no such file, or it is damaged.
-    """
-    require_file(file, what, TABLE_BYTES)
-    try:
-        with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as text:
-            for _, element in ElementTree.iterparse(text):
-                yield element
-                element.clear()
-    except (ElementTree.ParseError, OSError, EOFError) as error:
-        raise InputError(f"{what}: {file} is damaged ({error}); make it anew") from None
-
-
-def read_vtypes(config: SumoConfig) -> tuple[str, ...]:
-    """Return the ids of the vTypes of a configuration's vehicles, in place of distributions their members; sorted.
-
-    Raises:
-        InputError: a file is damaged, or there are too many vTypes.
-    """
-    defined: set[str] = set()
-    used: set[str] = set()
-    distributions: set[str] = set()
-    for file in config.demand_files:
-        for element in _elements(file, "demand"):
-            if element.tag == "vType" and element.get("vClass") != "pedestrian":
-                defined.add(element.get("id"))
-            elif element.tag == "vTypeDistribution":
-                distributions.add(element.get("id"))
-            elif element.tag in ("vehicle", "trip", "flow"):
-                used.add(element.get("type", DEFAULT_VTYPE))
-    found = tuple(sorted(defined | (used - distributions)))
-    if len(found) > MOST_LABELS:
-        raise InputError(f"{config.file} has {len(found)} vTypes; at most {MOST_LABELS} fit into labels: use fewer")
-    return found
-
-
 def read_net(file: Path, *, with_internal: bool = True) -> Any:
     """Return a SUMO network, as sumolib reads it.
 
@@ -328,7 +207,18 @@ def read_net(file: Path, *, with_internal: bool = True) -> Any:
             f"{file} is a network of version {found}, which is of a newer SUMO than the one installed (up to {known}); "
             "build it again with this one's netconvert"
         )
+    for edge in net.getEdges():
+        for lane in edge.getLanes():
+            _require_sound(lane, file)
     return net
+
+
+def _require_sound(lane: Any, file: Path) -> None:
+    """Raise InputError where a lane has no length or shape: libsumo would end this process."""
+    shape = lane.getShape3D()
+    numbers = (lane.getLength(), lane.getSpeed(), *(number for point in shape for number in point))
+    if len(shape) < 2 or lane.getLength() <= 0.0 or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{file} is damaged: lane {lane.getID()!r} has no sound length, speed or shape; make it anew")
 
 
 @lru_cache(maxsize=4)

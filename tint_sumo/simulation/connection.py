@@ -26,9 +26,9 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.network import sumo_program
 
 _CONNECT_TRIES, _CONNECT_WAIT_S = 600, 0.05  # sumo takes a moment to listen
-LOAD_STATE = "--load-state"
+LOAD_STATE = "load-state"
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError, TraCIException, FatalTraCIError)
-_SIMULATION_OPTIONS = ("--net-file", "--configuration-file", "--seed")  # in which simulations differ
+_SIMULATION_OPTIONS = ("--net-file", "--route-files", "--seed")  # in which simulations differ
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def _loads(load: Callable[[list[str]], Any]) -> Callable[[list[str]], None]:
 
     def load_once(options: list[str]) -> None:
         nonlocal had_state
-        has_state = LOAD_STATE in options
+        has_state = f"--{LOAD_STATE}" in options
         if had_state and not has_state:
             load(options)
         load(options)

@@ -5,9 +5,8 @@ around the ego are asked for with a context subscription, at the same cost howev
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,17 +17,19 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import BUILDING, Building, View
-from tint_sumo.scenes.sumocfg import DEFAULT_VTYPE, SumocfgScene, SumoConfig, network_roads
-from tint_sumo.simulation.connection import SUMO_ERRORS, Connection, connect
+from tint_sumo.scenes.sumo_config import DEFAULT_VTYPE, SumoConfig, base_vtype
+from tint_sumo.scenes.sumo_run import SumocfgRun
+from tint_sumo.scenes.sumocfg import SumocfgScene, network_roads
+from tint_sumo.simulation.connection import Connection, connect
+from tint_sumo.simulation.refusals import Refusals
 from tint_sumo.simulation.simulation import Simulation
-from tint_sumo.simulation.sumo import NO_COLLISION_CHECK, SPEED_MODE_OBEY_SETSPEED
+from tint_sumo.simulation.sumo import SPEED_MODE_OBEY_SETSPEED
 from tint_sumo.simulation.warm_starts import WarmStarts
 
 EGO = "tint_sumo.ego"  # vehicle, vType and route; no user's id
 _ONLY_STRATEGIC_CHANGES = 513  # lane changes: those that the route asks for, where there is room
 _ENTRY_PATIENCE_S = 60.0  # the ego waits for room at its start for so long
 _SEEN = (constants.VAR_POSITION, constants.VAR_ANGLE, constants.VAR_DISTANCE, constants.VAR_SPEED)
-_SEED_BITS = 31
 _AROUND_M = (30.0, 20.0)  # pictures show so much to each side of the ego
 
 Sight = Mapping[int, Any]  # a vehicle's variables of _SEEN
@@ -61,54 +62,19 @@ class Kinds:
         return self._known[vtype]
 
     def _look_up(self, vehicle_id: str, vtype: str) -> VehicleKind:
-        if vtype not in self._vtypes:
+        label = base_vtype(vtype, self._vtypes)
+        if label not in self._vtypes:
             raise InputError(
                 f"vehicle {vehicle_id!r} has vType {vtype!r}, which no vehicle or vType of {self._config.file} names; "
                 "define it in a route or additional file"
             )
         types = self._connection.vehicletype
         return VehicleKind(
-            self._vtypes.index(vtype),
+            self._vtypes.index(label),
             (types.getLength(vtype), types.getWidth(vtype)),
             types.getMinGap(vtype),
             types.getTau(vtype),
         )
-
-
-def sumo_options(config: SumoConfig, seed: int | Sequence[int], step_s: float | None = None) -> list[str]:
-    """Return command-line options that run a configuration with this seed, and keep it from writing its files."""
-    draws = np.random.SeedSequence(seed).generate_state(1)
-    return [
-        *("--configuration-file", str(config.file)),
-        *("--seed", str(int(draws[0]) % 2**_SEED_BITS)),
-        *("--random", "false"),
-        *(() if step_s is None else ("--step-length", str(step_s))),
-        *NO_COLLISION_CHECK,
-        *("--no-step-log", "true"),
-        *("--no-warnings", "true"),
-        *("--verbose", "false"),
-        *("--duration-log.disable", "true"),
-        *(part for option in config.outputs for part in (f"--{option}", "/dev/null")),
-    ]
-
-
-@dataclass(frozen=True)
-class Refusals:
-    """Raises InputError, one line, where SUMO finds fault with the configuration in a ``with`` block.
-
-    A class, since a step of a few vehicles would notice the time that a generator takes.
-    """
-
-    config: SumoConfig
-
-    def __enter__(self) -> None:
-        """Do nothing."""
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        if isinstance(error, SUMO_ERRORS):
-            reason = " ".join(str(error).split())
-            file = self.config.file
-            raise InputError(f"SUMO does not run {file} ({reason}); try it with: sumo -c {file}") from None
 
 
 def _box(sight: Sight, size_m: tuple[float, float], origin_m: tuple[float, float]) -> tuple[float, ...]:
@@ -144,8 +110,9 @@ class SumocfgSimulation(Simulation):
         self._ego_size_m = (scene.vehicle.length_m, scene.vehicle.width_m)
         self.passed_m = np.array([np.inf])  # no vehicle's way is ever left behind
         with self._refusals:
-            self.connection = connect(sumo_options(scene.config, seed=0), backend)
-        self.warm_starts = WarmStarts(scene, self.connection, partial(sumo_options, scene.config))
+            self._run = SumocfgRun(scene.config)
+            self.connection = connect(self._run.options(seed=0), backend)
+        self.warm_starts = WarmStarts(scene, self.connection, self._run)
         self._kinds = Kinds(scene.config, scene.vtypes, self.connection)
         self._drives = False
         self.slot: dict[str, int] = {}
@@ -161,7 +128,7 @@ class SumocfgSimulation(Simulation):
 
     def close(self) -> None:
         super().close()
-        self.warm_starts.close()
+        self._run.close()
 
     # Episodes
 

@@ -5,6 +5,7 @@ SUMO runs the traffic of the first seconds, with its outputs off: the numbers ar
 
 import shlex
 from collections import Counter
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -13,9 +14,11 @@ from xml.etree import ElementTree
 
 from tint_sumo.core.reading import TABLE_BYTES, open_file, unpacked
 from tint_sumo.scenes.ego_routes import EgoRoute, Turn, suggest_routes
-from tint_sumo.scenes.sumocfg import EGO_CLASS, SumocfgScene, SumoConfig, read_config, read_net, read_vtypes
+from tint_sumo.scenes.sumo_config import SumoConfig, read_config, read_vtypes
+from tint_sumo.scenes.sumo_run import SumocfgRun
+from tint_sumo.scenes.sumocfg import EGO_CLASS, SumocfgScene, read_net
 from tint_sumo.simulation.connection import connect
-from tint_sumo.simulation.sumocfg import Refusals, sumo_options
+from tint_sumo.simulation.refusals import Refusals
 from tint_sumo.simulation.vtypes import VType, find_vtype, read_vtype_table
 
 WATCHED_S = 100.0  # so much traffic is looked at
@@ -74,7 +77,7 @@ class Check:
             "network": asdict(self.network),
             "vtypes": {name: asdict(vtype) for name, vtype in self.vtypes.items()},
             "traffic": traffic,
-            "outputs_off": list(self.config.outputs),
+            "turned_off": list(self.config.left_out),
             "routes": [asdict(route) for route in self.routes],
             "passed": self.passed,
         }
@@ -142,8 +145,8 @@ def _watch(config: SumoConfig) -> Traffic:
     vehicles: Counter[str] = Counter()
     turns: Counter[Turn] = Counter()
     persons = most_at_once = teleports = 0
-    with Refusals(config):
-        connection = connect(sumo_options(config, seed=0))
+    with Refusals(config), closing(SumocfgRun(config)) as run:
+        connection = connect(run.options(seed=0))
         try:
             simulation, vehicle = connection.simulation, connection.vehicle
             begin_s = simulation.getTime()
@@ -187,8 +190,8 @@ def report(found: Check) -> str:
     made = sum(count for name, count in traffic.vehicles.items() if name not in found.vtypes)
     if made:
         lines.append(f"  {made:,} vehicles have vTypes that SUMO makes at run time")
-    if found.config.outputs:
-        lines.append(f"turned off        {', '.join(found.config.outputs)}: files that SUMO would write")
+    if found.config.left_out:
+        lines.append(f"turned off        {', '.join(found.config.left_out)}")
     lines += ["", *_ego_lines(found)]
     return "\n".join(lines)
 

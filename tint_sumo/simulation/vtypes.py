@@ -8,19 +8,15 @@ from xml.sax import SAXException
 from xml.sax.saxutils import quoteattr
 
 import sumolib
-from libsumo import TraCIException
-from traci.exceptions import FatalTraCIError
-from traci.exceptions import TraCIException as TraciException
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
 from tint_sumo.core.reading import TABLE_BYTES, require_file
-from tint_sumo.scenes.sumocfg import read_config
-from tint_sumo.simulation.connection import connect
+from tint_sumo.scenes.sumo_config import base_vtype, read_config
+from tint_sumo.simulation.connection import SUMO_ERRORS, connect
 
 _ATTRIBUTES = ("id", "vClass", "length", "width")  # of a vType: its size follows from them
 _MODEL, _USUAL_MODEL = "carFollowModel", "Krauss"  # SUMO does not say which model a type has
-_DEFINED_FOR_ONE = "@"  # SUMO calls the type of a vehicle that has values of its own TYPE@VEHICLE
 
 
 @dataclass(frozen=True)
@@ -53,7 +49,7 @@ def read_vtype_table(file: Path) -> Mapping[str, VType]:
         options = ["--net-file", str(shipped("sumo_net") / "tint.net.xml"), "--additional-files", str(additional)]
         try:
             connection = connect([*options, "--no-step-log", "true", "--no-warnings", "true"])
-        except (TraCIException, TraciException, FatalTraCIError) as error:
+        except SUMO_ERRORS as error:
             raise InputError(f"SUMO refuses a vType of {file} ({' '.join(str(error).split())}); correct it") from None
         try:
             types = connection.vehicletype
@@ -72,7 +68,7 @@ def read_vtype_table(file: Path) -> Mapping[str, VType]:
 
 def find_vtype(name: str, vtypes: Mapping[str, VType]) -> VType | None:
     """Return the vType with this id, or the one that a single vehicle's type was made of."""
-    return vtypes.get(name) or vtypes.get(name.partition(_DEFINED_FOR_ONE)[0])
+    return vtypes.get(base_vtype(name, vtypes))
 
 
 def _defined(file: Path) -> list[dict[str, str]]:

@@ -9,8 +9,7 @@ with persons, parking areas and calibrators SUMO 1.28 can end with a segmentatio
 """
 
 import math
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,20 +17,20 @@ from pathlib import Path
 import numpy as np
 
 from tint_sumo.core.errors import InputError
+from tint_sumo.scenes.sumo_run import SumocfgRun
 from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation.connection import LOAD_STATE, SUMO_ERRORS, Connection
 
 _CHOICE, _STATE = 2, 3  # what is drawn from a seed: the number of a state; and from the number of a state: its traffic
 _SAME_M = 0.01  # vehicles and persons of a loaded state are at most so far from where they were
-_SAVING = (
-    *("--save-state.rng", "false"),  # whoever loads it has other random numbers
-    *("--save-state.transportables", "true"),
-    *("--save-state.constraints", "true"),  # of rail signals
-    *("--save-state.precision", "16"),
-)
-_LOADING = ("--load-state.offset", "0", "--load-state.remove-vehicles", "")  # the user's are for a state of the user's
+_SAVING = {
+    "save-state.rng": "false",  # whoever loads it has other random numbers
+    "save-state.transportables": "true",
+    "save-state.constraints": "true",  # of rail signals
+    "save-state.precision": "16",
+}
+_LOADING = {"load-state.offset": "0", "load-state.remove-vehicles": ""}  # the user's are for a state of the user's
 
-Options = Callable[[int | Sequence[int]], list[str]]  # returns command-line options of a simulation with a seed
 _Positions = dict[tuple[str, str], tuple[float, ...]]  # of all vehicles and persons, m
 
 
@@ -39,17 +38,16 @@ _Positions = dict[tuple[str, str], tuple[float, ...]]  # of all vehicles and per
 class WarmStarts:
     """Begins the traffic of episodes in a running simulation.
 
-    States lie in a temporary folder, at most as many as the scene has warm starts. They follow from the scene and their
-    number alone, so that it does not matter which process has made them, and for which episode.
+    States lie in the run's temporary folder, at most as many as the scene has warm starts. They follow from the scene
+    and their number alone, so that it does not matter which process has made them, and for which episode.
     """
 
     scene: SumocfgScene
     connection: Connection
-    options: Options
+    run: SumocfgRun
     states: dict[int, Path | None] = field(
         default_factory=dict
     )  # by number; None where a loaded state is not the saved
-    _folder: list[tempfile.TemporaryDirectory[str]] = field(default_factory=list)  # at most one
 
     def begin(self, seed: int) -> None:
         """Load the simulation of an episode, up to the time at which the ego appears.
@@ -59,14 +57,9 @@ class WarmStarts:
         """
         state = self._state_of(seed) if self.scene.warm_starts else None
         if state is None:
-            self._warm_up(self.options(seed))
+            self._warm_up(self.run.options(seed))
         else:
-            self._load_state(self.options(seed), state)
-
-    def close(self) -> None:
-        """Remove all states; safe to call twice."""
-        while self._folder:
-            self._folder.pop().cleanup()
+            self._load_state(seed, state)
 
     def _state_of(self, seed: int) -> Path | None:
         """Return the state that an episode begins with; None if its traffic is to be warmed up anew."""
@@ -78,23 +71,21 @@ class WarmStarts:
 
     def _save(self, number: int) -> Path | None:
         """Save a state; return its file, or None if SUMO does not load what it has saved."""
-        if not self._folder:
-            self._folder.append(tempfile.TemporaryDirectory(prefix="tint_sumo."))
-        file = Path(self._folder[0].name) / f"{number}.xml"
-        options = self.options([number, _STATE])
-        self._warm_up([*options, *_SAVING])
-        self.connection.simulation.saveState(str(file))
+        file = self.run.output / f"{number}.xml"
+        seed = (number, _STATE)
+        self._warm_up(self.run.options(seed, more=_SAVING))
+        self.connection.simulation.saveState(file.name)  # SUMO puts it into the folder for output
         saved = self._positions()
-        self._load_state(options, file)
+        self._load_state(seed, file)
         return file if _are_same(saved, self._positions()) else None
 
     def _warm_up(self, options: list[str]) -> None:
         self.connection.load(options)
         self.connection.step(self.connection.simulation.getTime() + self.scene.warm_up_s)
 
-    def _load_state(self, options: list[str], file: Path) -> None:
+    def _load_state(self, seed: int | Sequence[int], file: Path) -> None:
         with _refusals(self.scene):
-            self.connection.load([*options, LOAD_STATE, str(file), *_LOADING])
+            self.connection.load(self.run.options(seed, more={LOAD_STATE: str(file), **_LOADING}))
 
     def _positions(self) -> _Positions:
         return {

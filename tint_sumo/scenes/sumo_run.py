@@ -1,0 +1,87 @@
+"""Runs of a SUMO configuration that leave all files of its user as they are."""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import weakref
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from functools import lru_cache
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from tint_sumo.core.errors import InputError
+from tint_sumo.scenes.sumo_config import SumoConfig, first_reason
+
+_SEED_BITS = 31
+_UP = "../" * 64  # from any folder to the root
+_CONTROLLED = {
+    "random": "false",
+    "collision.action": "none",  # the ego's are found here, and others' change nothing
+    "no-step-log": "true",
+    "no-warnings": "true",
+    "verbose": "false",
+    "duration-log.disable": "true",
+}
+_LOAD = """
+import sys, libsumo
+try:
+    libsumo.start(["sumo", *sys.argv[1:]])
+except Exception as error:
+    sys.exit(f"Error: {error}")
+libsumo.close()
+"""
+
+
+class SumocfgRun:
+    """Command-line options of runs of a configuration.
+
+    The configuration's output options are left out. Files that its additional files and devices write, wherever, go to
+    a temporary folder: SUMO puts ``output-prefix`` before the last part of each path. ``close`` removes that folder,
+    with all that has been put into it.
+    """
+
+    def __init__(self, config: SumoConfig) -> None:
+        folder = Path(tempfile.mkdtemp(prefix="tint_sumo_"))
+        self.close = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        self.output = folder / "output"
+        self.output.mkdir()
+        prefix = {"output-prefix": f"{_UP}{self.output.resolve().relative_to('/')}/"}
+        self._values = config.values(folder) | _CONTROLLED | prefix
+
+    def options(
+        self, seed: int | Sequence[int], step_s: float | None = None, more: Mapping[str, str] | None = None
+    ) -> list[str]:
+        """Return the options of a run.
+
+        Args:
+            seed: of SUMO's random numbers.
+            step_s: step length; the configuration's if not given.
+            more: further options, without their dashes.
+        """
+        draws = np.random.SeedSequence(seed).generate_state(1)
+        values = self._values | {"seed": str(int(draws[0]) % 2**_SEED_BITS)}
+        values |= {} if step_s is None else {"step-length": str(step_s)}
+        return list(chain.from_iterable((f"--{name}", value) for name, value in (values | dict(more or {})).items()))
+
+
+def require_loads(config: SumoConfig) -> None:
+    """Let a process of its own load a configuration: SUMO can crash at damaged files, and prints more than one line.
+
+    Raises:
+        InputError: SUMO does not load it, or crashes.
+    """
+    _require_loads(config, config.digest)
+
+
+@lru_cache(maxsize=64)
+def _require_loads(config: SumoConfig, _digest: str) -> None:
+    with closing(SumocfgRun(config)) as run:
+        command = [sys.executable, "-c", _LOAD, *run.options(seed=0)]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode != 0:
+        reason = first_reason(result.stderr) or f"it ends with code {result.returncode}"
+        raise InputError(f"SUMO does not run {config.file} ({reason}); try it with: sumo -c {config.file}")

@@ -13,6 +13,8 @@ from tests.scenes.networks import UserNetwork
 from tint_sumo.config import REWARD_PRESETS
 from tint_sumo.envs.rows import (
     OUTCOMES,
+    TRACKS,
+    TRUTH,
     Scales,
     TaskRules,
     add_up,
@@ -204,6 +206,7 @@ def test_infos_of_a_row() -> None:
     assert outcome_names(np.array([0, 3, 2, 1])).tolist() == ["", "collision", "timeout", "success"]
     copies = copied(rows)
     assert set(copies) == set(rows.dtype.names or ()) and copies["goal"].tolist() == [2.5, 2.5]
+    assert set(copied(rows)) - set(copied(rows, ("traits", "passed"))) == {*TRACKS, *TRUTH} - {"passed"}
     copies["goal"][:] = 0.0
     assert rows["goal"].tolist() == [2.5, 2.5]
 

@@ -1,7 +1,7 @@
 """The record of an environment after a step, written by compiled code: observation, infos, rewards and outcome."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -18,6 +18,7 @@ OBSERVATION_KEYS = ("ego", "vehicles", "mask")
 TRACKS = ("position_m", "gap_m", "passed")  # per vehicle slot, if they are asked for
 SEEN = ("vehicles", "mask", "traits", "track", "slot", *TRACKS)  # what the sensor says, and true traits that fit it
 TRUTH = ("track", "slot", "true_mask", "true_vehicles", "true_traits")  # per vehicle slot, if the sensor is not perfect
+SLOT_INFOS = ("traits", *TRACKS, *TRUTH)  # what infos can have for each vehicle slot
 REWARD_TERMS = ("goal", "collision", "speed", "step")
 Outcome = Literal["success", "timeout", "collision"]
 OUTCOMES: tuple[str, ...] = get_args(Outcome)
@@ -321,6 +322,8 @@ def show_earlier(rows: Rows, frames: Rows, steps: Numbers) -> None:
             row.passed[slot] = earlier.passed[slot]
 
 
-def copied(rows: Rows) -> dict[str, NDArray[Any]]:
-    """Return a copy of each field, (N, ...)."""
-    return {field: rows[field].copy() for field in rows.dtype.names or ()}
+def copied(rows: Rows, slot_infos: Collection[str] = SLOT_INFOS) -> dict[str, NDArray[Any]]:
+    """Return a copy of each field, (N, ...), without the fields of ``SLOT_INFOS`` that are not among ``slot_infos``."""
+    return {
+        field: rows[field].copy() for field in rows.dtype.names or () if field in slot_infos or field not in SLOT_INFOS
+    }

@@ -42,7 +42,7 @@ class Sensing:
         self.source: Numbers = np.full(shape, NO_VEHICLE)
         self.track: Numbers = np.full(shape, NO_VEHICLE)
         self.noise_m: Floats = np.zeros((*shape, 2))
-        self.seen: Bools = np.zeros(shape, bool)
+        self.seen: Bools = np.zeros(shape, bool) if sensor.hides else simulation.slots.present
         self._lost: Bools = np.zeros(shape, bool)
         self._known: Numbers = np.full(shape, NO_VEHICLE)  # number of the vehicle in each slot of the simulation
         self._shown: Numbers = np.full(shape, NO_VEHICLE)  # number of the vehicle in each slot of the observation
@@ -58,7 +58,7 @@ class Sensing:
         """Begin an episode of this seed in an environment."""
         for array in (self.source, self.track, self._known, self._shown):
             array[index] = NO_VEHICLE
-        for nothing in (self.noise_m, self.seen, self._lost, self._tracks):
+        for nothing in (self.noise_m, self._lost, self._tracks):
             nothing[index] = 0
         for draws in (self._normals, self._uniforms):
             if draws:
@@ -72,7 +72,6 @@ class Sensing:
             follow_noise(number, self._known[envs], *self._normals.ahead(envs), self._memory, self.noise_m[envs])
         if not sensor.hides:
             show_all(present, number, self.source[envs], self.track[envs])
-            self.seen[envs] = present
         else:
             find_seen(egos.box[envs], present, slots.box[envs], self._simulation.walls, self._sight, self.seen[envs])
             if self._uniforms:
@@ -89,7 +88,8 @@ class Sensing:
                 self.track[envs],
                 self._tracks[envs],
             )
-        self._known[envs] = number
+        if self._normals or self._uniforms:
+            self._known[envs] = number
 
     def delay(self, steps: Numbers, envs: slice, rows: Rows) -> None:
         """Put in place of what is seen in rows (N,) of some environments what was seen earlier.

@@ -169,7 +169,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         taken = checked_actions(actions, (self.num_envs,), int(self.single_action_space.n))
         with self._calls:
             ended = self.batch.step(taken)
-        rows = copied(self.batch.rows)
+        rows = copied(self.batch.rows, self.slot_infos)
         for end in ended:
             for key in ("reward", "terminated", "truncated"):
                 rows[key][end.index] = end.row[key]
@@ -219,7 +219,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _shown(self, mask: NDArray[np.bool_] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Return the observation of the present steps, and the infos of the environments in the mask, or of all."""
-        rows = copied(self.batch.rows)
+        rows = copied(self.batch.rows, self.slot_infos)
         return observation_of(rows), self._infos(rows, mask)
 
     def _infos(self, rows: dict[str, NDArray[Any]], mask: NDArray[np.bool_] | None = None) -> dict[str, Any]:

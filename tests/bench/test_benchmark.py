@@ -21,6 +21,7 @@ TINY = Sizes(
     turns=2,
     turn_steps=3,
     gym_turn_steps=5,
+    network_steps=5,
     windows=20,
     training_windows=50,
     ppo=TINY_PPO,
@@ -42,6 +43,7 @@ def test_the_benchmark_measures_everything() -> None:
         "env_to_checking_floor",
         "gym_env_steps_per_s",
         "cores",
+        "networks",
         "record_windows_per_s",
         "peak_memory_mib",
         "windows",
@@ -59,6 +61,8 @@ def test_the_benchmark_measures_everything() -> None:
     for cores in printed["cores"]:
         assert cores.keys() == {"replicas", "one", "two", "ratio"}
         assert min(cores.values()) > 0.0
+    assert [network.pop("name") for network in printed["networks"]] == ["fokr_bs_demo", "grid"]
+    assert all(min(network.values()) > 0.0 for network in printed["networks"])
     assert list(printed["breakdown_us"]) == list(StepPart)
     speeds = [printed[key] for key in printed if key.endswith("steps_per_s")]
     assert min(speeds + list(printed["breakdown_us"].values())) > 0.0

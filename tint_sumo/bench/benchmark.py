@@ -23,6 +23,7 @@ import torch
 
 from tint_sumo import ENV_IDS
 from tint_sumo.bench.measuring import Clocks, Turn, turns_apart
+from tint_sumo.bench.networks import NetworkSpeed, network_speeds
 from tint_sumo.bench.policies import DECISION_METHOD, INSTALL_SB3_CONTRIB, decision_ms, training_speed
 from tint_sumo.config import PPO_BUDGETS, TRAIT_BUDGETS, WINDOW_STEPS, PpoSettings
 from tint_sumo.core.determinism import single_threaded
@@ -58,6 +59,7 @@ class Sizes:
     turns: int = 9
     turn_steps: int = 100
     gym_turn_steps: int = 1_000  # steps of the single environment
+    network_steps: int = 300  # steps of the environment in a SUMO configuration
     windows: int = 100_000
     training_windows: int = 40_000
     ppo: PpoSettings = PPO_BUDGETS["full"]
@@ -70,6 +72,7 @@ QUICK = Sizes(
     turns=3,
     turn_steps=50,
     gym_turn_steps=500,
+    network_steps=100,
     windows=10_000,
     training_windows=5_000,
     ppo=replace(PPO_BUDGETS["full"], n_envs=64, n_minibatches=4),  # half a rollout, minibatches as large as ever
@@ -113,6 +116,7 @@ class Benchmark:
     scenes_to_t_intersection: dict[str, float]  # speed of other scenes' environments to the T-intersection's
     gym_env_steps_per_s: float
     cores: tuple[Cores, ...]
+    networks: tuple[NetworkSpeed, ...]  # SUMO configurations
     record_windows_per_s: float
     peak_memory_mib: float  # peak of all of the recorder's processes together; what they share counts once
     windows: int
@@ -139,6 +143,7 @@ class Benchmark:
             *((f"  {name} to t_intersection", f"{ratio:.2f}") for name, ratio in self.scenes_to_t_intersection.items()),
             ("one gymnasium environment", f"{self.gym_env_steps_per_s:,.0f} steps/s"),
             *(row for cores in self.cores for row in cores.rows()),
+            *(row for network in self.networks for row in network.rows()),
             (f"recorder, {_RECORD_WORKERS} workers", f"{self.record_windows_per_s:,.0f} windows/s"),
             ("  its processes' peak memory", f"{self.peak_memory_mib:,.0f} MiB"),
             ("memory growth while stepping", f"{self.memory_growth_mib:+.1f} MiB"),
@@ -168,7 +173,7 @@ class Benchmark:
 def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmark:
     """Measure everything, one after the other."""
     sizes = sizes or Sizes()
-    measurements = (_speed, _scenes, _breakdown, _gym_speed, _cores, _record, _memory, _traits, _policies)
+    measurements = (_speed, _scenes, _breakdown, _gym_speed, _cores, _networks, _record, _memory, _traits, _policies)
     found: dict[str, Any] = {}
     with one_job("bench", progress=progress) as report:
         for number, measurement in enumerate(measurements):
@@ -312,6 +317,10 @@ def _gym_speed(sizes: Sizes) -> dict[str, Any]:
 def _cores(sizes: Sizes) -> dict[str, Any]:
     """Measure with the usual number of replicas, and with that number in each worker."""
     return {"cores": tuple(_workers_speed(replace(sizes, replicas=times * sizes.replicas)) for times in (1, 2))}
+
+
+def _networks(sizes: Sizes) -> dict[str, Any]:
+    return {"networks": network_speeds(sizes.turns, sizes.network_steps)}
 
 
 def _workers_speed(sizes: Sizes) -> Cores:

@@ -44,6 +44,7 @@ def test_the_benchmark_measures_everything() -> None:
         "gym_env_steps_per_s",
         "cores",
         "networks",
+        "network_workers",
         "record_windows_per_s",
         "peak_memory_mib",
         "windows",

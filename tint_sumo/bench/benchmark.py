@@ -117,6 +117,7 @@ class Benchmark:
     gym_env_steps_per_s: float
     cores: tuple[Cores, ...]
     networks: tuple[NetworkSpeed, ...]  # SUMO configurations
+    network_workers: float  # two workers to one in such a configuration
     record_windows_per_s: float
     peak_memory_mib: float  # peak of all of the recorder's processes together; what they share counts once
     windows: int
@@ -144,6 +145,7 @@ class Benchmark:
             ("one gymnasium environment", f"{self.gym_env_steps_per_s:,.0f} steps/s"),
             *(row for cores in self.cores for row in cores.rows()),
             *(row for network in self.networks for row in network.rows()),
+            ("  two workers to one", f"{self.network_workers:.2f}"),
             (f"recorder, {_RECORD_WORKERS} workers", f"{self.record_windows_per_s:,.0f} windows/s"),
             ("  its processes' peak memory", f"{self.peak_memory_mib:,.0f} MiB"),
             ("memory growth while stepping", f"{self.memory_growth_mib:+.1f} MiB"),
@@ -320,7 +322,8 @@ def _cores(sizes: Sizes) -> dict[str, Any]:
 
 
 def _networks(sizes: Sizes) -> dict[str, Any]:
-    return {"networks": network_speeds(sizes.turns, sizes.network_steps)}
+    networks, workers = network_speeds(sizes.turns, sizes.network_steps)
+    return {"networks": networks, "network_workers": workers}
 
 
 def _workers_speed(sizes: Sizes) -> Cores:

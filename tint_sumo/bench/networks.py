@@ -38,7 +38,6 @@ class NetworkSpeed:
     env_step_us: float
     sumo_step_us: float  # SUMO's step, the ego's speed and the subscription: the same traffic without the environment
     env_to_sumo: float  # ratio of the speeds
-    two_workers: float  # steps per second of two environments in two workers, to one in one process
     reset_ms: float
     warm_reset_ms: float  # with a warm start that has been made
 
@@ -46,22 +45,25 @@ class NetworkSpeed:
         return [
             (f"{self.name}, {self.vehicles} vehicles", f"{self.env_step_us:.0f} us a step"),
             ("  its speed to SUMO's alone", f"{self.env_to_sumo:.2f}"),
-            ("  in two workers to one process", f"{self.two_workers:.2f}"),
             (f"  a reset, {_WARM_UP_S:g} s of traffic", f"{self.reset_ms:.0f} ms"),
             ("  with a warm start", f"{self.warm_reset_ms:.0f} ms"),
         ]
 
 
-def network_speeds(turns: int, steps: int) -> tuple[NetworkSpeed, ...]:
+def network_speeds(turns: int, steps: int) -> tuple[tuple[NetworkSpeed, ...], float]:
     """Measure in the streets of Braunschweig that SUMO ships, and in a grid of 4 by 4 crossings with traffic lights.
 
     Args:
         turns: of each measurement; the median counts.
         steps: of each turn.
+
+    Returns:
+        The speed in each of them, and the steps per second of two environments in two workers of the grid, to one.
     """
     with tempfile.TemporaryDirectory(prefix="tint_sumo.") as folder:
-        scenes = (_braunschweig(), _grid(Path(folder)))
-        return tuple(_measured(scene, turns, steps) for scene in scenes)
+        grid = _grid(Path(folder))
+        speeds = tuple(_measured(scene, turns, steps) for scene in (_braunschweig(), grid))
+        return speeds, _workers_ratio(grid, turns, steps)
 
 
 def _braunschweig() -> SumocfgScene:
@@ -107,7 +109,6 @@ def _measured(scene: SumocfgScene, turns: int, steps: int) -> NetworkSpeed:
         env_us,
         sumo_us,
         median(bare / whole for whole, bare in pairs),
-        _workers_ratio(scene, turns, steps),
         median(resets_ms),
         _warm_reset_ms(scene, turns),
     )

@@ -1,13 +1,15 @@
 """Films in SUMO configurations."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 
 from tests.scenes.networks import UserNetwork
+from tint_sumo.envs.rendering import BUILDING_COLOUR
 from tint_sumo.films.driving import drive_case
 from tint_sumo.films.film import render_case
 from tint_sumo.films.frames import EGO_COLOUR, SCENE_HEIGHT_PX, SIZE_PX, TITLE_HEIGHT_PX
@@ -50,5 +52,13 @@ def test_a_frame_shows_the_ego_in_its_middle_and_each_vehicle_in_the_colour_of_i
         for number in set(moment.traits[near].tolist()):
             assert np.isclose(picture, scene.trait_colours[number], atol=6).all(axis=2).sum() > 30
     assert shown > 0
+    ego = driven.moments[0].ego
+    beside = ((5.0, 20.0), (15.0, 20.0), (15.0, 12.0))  # ahead of the ego's start is north of no road
+    built = replace(artist, buildings=(tuple((ego["x_m"] + x_m, ego["y_m"] + y_m) for x_m, y_m in beside),))
+    was, now = (
+        np.isclose(one.frame(driven.moments[0]).crop(SPACE), ImageColor.getrgb(BUILDING_COLOUR), atol=6).all(axis=2)
+        for one in (artist, built)
+    )
+    assert was.sum() == 0 and now.sum() == pytest.approx(40.0 * (SIZE_PX[0] / 100.0) ** 2, rel=0.1)
     stays, moved = (np.asarray(artist.frame(driven.moments[index]).crop(SPACE)) for index in (0, -1))
     assert (stays != moved).any(axis=2).mean() > 0.02  # the roads pass by

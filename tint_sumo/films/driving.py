@@ -17,6 +17,7 @@ from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.trait_sources import Observation, OracleTraits, one_hot
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
 from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers
+from tint_sumo.scenes.scene import Building
 from tint_sumo.simulation import SceneSimulation, Simulation
 
 _BRAKING_MPS2 = 0.5  # vehicles that slow down by more than this show it
@@ -52,6 +53,7 @@ class Driven:
     case: Case
     moments: tuple[Moment, ...]
     origin_m: tuple[float, float]  # position of the scene's origin in the network
+    buildings: tuple[Building, ...] = ()
 
 
 def drive_case(contender: Contender, case: int, case_set: int, task: TaskSettings) -> Driven:
@@ -71,7 +73,7 @@ def drive_case(contender: Contender, case: int, case_set: int, task: TaskSetting
         return venv
 
     evaluation = evaluate(recorder, make_venv, 1, case_set, first=case)
-    return Driven(evaluation.cases[0], tuple(recorder.moments), recorder.origin_m)
+    return Driven(evaluation.cases[0], tuple(recorder.moments), recorder.origin_m, recorder.buildings)
 
 
 class _Recorder:
@@ -86,6 +88,7 @@ class _Recorder:
         self._value: float | None = None
         self.moments: list[Moment] = []
         self.origin_m = (0.0, 0.0)
+        self.buildings: tuple[Building, ...] = ()
 
     def attach(self, venv: VecEnv) -> None:
         """Look at the simulation of these environments from now on."""
@@ -129,7 +132,7 @@ class _Recorder:
         if self.moments and self.moments[-1].outcome:
             return
         simulation, (info,) = self._simulation, infos
-        self.origin_m = simulation.origin_m
+        self.origin_m, self.buildings = simulation.origin_m, simulation.buildings
         egos, slots = simulation.egos, simulation.slots
         brakes, ego_brakes = self._speeds.brakes()
         attention = None if self._network is None else self._network.attention_weights(observation)[0]

@@ -90,7 +90,9 @@ def _artist(contender: Contender, task: TaskSettings, driven: Driven, case: str)
     colour = ImageColor.getrgb(look_of(contender.method).colour)
     if isinstance(scene, SumocfgScene):
         title = _SPACE.join(parts)
-        return NetworkArtist(scene, title, colour, vtypes_in(driven.moments), driven.origin_m, task.sensor)
+        return NetworkArtist(
+            scene, title, colour, vtypes_in(driven.moments), driven.origin_m, task.sensor, driven.buildings
+        )
     assert task.p_conservative is not None
     title = _SPACE.join([*parts, f"P(conservative) {task.p_conservative.text}"])
     has_attention = driven.moments[0].attention is not None

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import shapely
 from PIL import Image, ImageDraw
 
 from tint_sumo.config import PERFECT, Sensor
-from tint_sumo.envs.rendering import Canvas, background, pale
+from tint_sumo.envs.rendering import BUILDING_COLOUR, Canvas, background, pale
 from tint_sumo.films.driving import Moment
 from tint_sumo.films.frames import (
     EGO_COLOUR,
@@ -22,6 +23,7 @@ from tint_sumo.films.frames import (
     write_state,
 )
 from tint_sumo.scenes import SumocfgScene, View
+from tint_sumo.scenes.scene import Building
 from tint_sumo.scenes.sumocfg import network_roads
 
 _HALF_WIDTH_M = 50.0  # a frame shows so much to the left and right of the ego
@@ -38,6 +40,7 @@ class NetworkArtist:
     vtypes: tuple[int, ...]  # numbers of the vTypes in the legend
     origin_m: tuple[float, float]  # position of the scene's origin in the network
     sensor: Sensor = PERFECT
+    buildings: tuple[Building, ...] = ()
 
     def frame(self, moment: Moment) -> Image.Image:
         """Return an RGB image of ``SIZE_PX``."""
@@ -54,6 +57,8 @@ class NetworkArtist:
             network_roads(self.scene.config.net_file), view.moved(*self.origin_m), SIZE_PX[0], OVERSAMPLING
         )
         canvas = Canvas(view, roads.copy(), width_px=SIZE_PX[0], oversampling=OVERSAMPLING)
+        for building in self.buildings:
+            canvas.fill(shapely.Polygon(building), BUILDING_COLOUR)
         for slot in np.flatnonzero(moment.present).tolist():
             colour, is_seen = self.scene.trait_colours[moment.traits[slot]], bool(moment.seen[slot])
             canvas.vehicle(moment.boxes[slot], colour if is_seen else pale(colour), with_glass=is_seen)

@@ -1,0 +1,49 @@
+"""Windows as a sensor gives them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tint_sumo.config import SENSORS, Mix, Sensor
+from tint_sumo.core.errors import InputError
+from tint_sumo.dataset.windows import Windows
+from tint_sumo.envs import TaskSettings
+from tint_sumo.traits.perceived import perceived_windows
+
+TASK = TaskSettings(p_conservative=Mix(0.5))
+DROPOUTS = Sensor(dropouts_per_s=1.0, dropout_s=0.3)
+
+
+def windows_with(sensor: Sensor, **changes: int) -> tuple[Windows, np.ndarray]:
+    return perceived_windows(replace(TASK, sensor=sensor, time_limit_s=10.0), 130, num_envs=4, seed=5, **changes)
+
+
+def test_windows_of_a_perfect_sensor_are_of_smooth_tracks_with_the_labels_of_their_drivers() -> None:
+    windows, labels = windows_with(SENSORS["perfect"])
+    assert len(windows) == len(labels) > 100 and set(labels.tolist()) == {0, 1}
+    moved_m = np.diff(windows.states[..., 0], axis=1)[np.arange(1, 20) < windows.length[:, None]]
+    assert (moved_m > -1e-5).all() and moved_m.max() < 0.31
+    for driver in np.unique(windows.driver):
+        assert len(set(labels[windows.driver == driver].tolist())) == 1
+    fast = windows.states[np.arange(len(windows)), windows.length - 1, 0] > 2.6 * 0.1 * (windows.length - 1)
+    assert (labels[fast] == 1).all()  # only aggressive drivers exceed 2.4 m/s
+    assert set(windows.episode.tolist()) == set(range(8)), "a second episode begins in each environment"
+
+
+def test_dropouts_make_shorter_tracks_and_noise_rougher_ones() -> None:
+    whole, _ = windows_with(SENSORS["perfect"])
+    parts, labels = windows_with(DROPOUTS)
+    assert len(np.unique(parts.driver)) > 1.5 * len(np.unique(whole.driver))
+    assert parts.length.mean() < whole.length.mean() and set(labels.tolist()) == {0, 1}
+    rough, _ = windows_with(SENSORS["noisy_0.2"])
+    full = rough.length == 20
+    bend_m = np.diff(rough.states[full, :, 0], n=2, axis=1)
+    assert bend_m.std() == pytest.approx(0.2 * np.sqrt(6.0), rel=0.1)
+
+
+def test_windows_follow_from_the_seed() -> None:
+    first, again = windows_with(DROPOUTS)[0], windows_with(DROPOUTS)[0]
+    np.testing.assert_array_equal(first.states, again.states)
+    with pytest.raises(InputError, match=r"steps must lie in 1 to 10,000,000, not 0"):
+        perceived_windows(TASK, 0)

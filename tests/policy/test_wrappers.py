@@ -3,11 +3,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tint_sumo.config import Sensor
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy import ActionRepeat, OracleTraits
+from tint_sumo.policy.trait_sources import StreamingTraits
 from tint_sumo.policy.wrappers import policy_venv
+from tint_sumo.traits import load
 
 GO, STOP = 2, 0
 
@@ -71,3 +74,26 @@ def test_every_step_is_shown_until_an_episode_s_very_end() -> None:
             np.testing.assert_array_equal(observation[key][env], value)
         np.testing.assert_array_equal(info["traits"], info["terminal_slots"]["traits"])
     assert (np.diff([step["ego"][0, 1] for step, _ in shown[:7]]) > 0).all()  # it never starts anew
+
+
+def test_a_vehicle_that_the_sensor_has_lost_is_another_driver_when_it_is_seen_again() -> None:
+    """The fifth number of streaming traits is how long a driver has been seen, in units of 10 s."""
+    sensor = Sensor(dropouts_per_s=1.0, dropout_s=0.3, occlusion=True)
+    venv = policy_venv(3, StreamingTraits(load("cross_window")), [TaskSettings(sensor=sensor)])
+    base = venv.unwrapped
+    assert isinstance(base, SceneVecEnv)
+    venv.seed(4)
+    observation = venv.reset()
+    ages: dict[tuple[int, int], int] = {}
+    for _ in range(60):
+        assert isinstance(observation, dict)
+        track = base.slots["track"]
+        for env, slot in np.argwhere(track >= 0).tolist():
+            known = (env, int(track[env, slot]))
+            ages[known] = ages.get(known, 0) + 1
+            assert round(observation["traits"][env, slot, 4] * 100) == ages[known]
+        assert not observation["traits"][track < 0].any()
+        observation, _, done, _ = venv.step(np.full(3, STOP))
+        assert not done.any()
+    venv.close()
+    assert len(ages) > 60  # tracks of some thirty vehicles

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 
 from tint_sumo.config import Sensor
 from tint_sumo.scenes.geometry import BOX
@@ -114,3 +115,35 @@ def test_walls_are_the_sides_of_polygons() -> None:
     assert walls_of((triangle,)).tolist() == sides
     assert walls_of((triangle, triangle)).tolist() == sides + sides
     assert walls_of(()).shape == (0, 4)
+
+
+def test_random_streets_are_seen_as_shapely_has_it() -> None:
+    rng = np.random.default_rng(3)
+    hidden = 0
+    for _ in range(30):
+        angles, count = rng.uniform(-math.pi, math.pi, 8), 7
+        street = [
+            box(*rng.uniform(-15.0, 15.0, 2), (math.cos(angle), math.sin(angle)), tuple(rng.uniform(1.0, 8.0, 2)))
+            for angle in angles[:count]
+        ]
+        building = tuple(tuple(rng.uniform(-9.0, 9.0, 2)) for _ in range(3))
+        ego = box(*rng.uniform(-15.0, 15.0, 2), NORTH)
+        shapes = [_polygon(one) for one in street]
+        ring = shapely.LinearRing(building)
+        expected = []
+        for number, one in enumerate(street):
+            points = [one[:2], *shapes[number].exterior.coords[:-1]]
+            lines = [shapely.LineString([ego[:2], point]) for point in points]
+            others = shapely.union_all(shapes[:number] + shapes[number + 1 :])
+            expected.append(any(not line.intersects(others) and not line.intersects(ring) for line in lines))
+        assert seen(OCCLUSION, ego, *street, buildings=(building,)) == expected
+        hidden += expected.count(False)
+    assert 40 < hidden < 30 * 7 - 40
+
+
+def _polygon(one: tuple) -> shapely.Polygon:
+    x_m, y_m, ahead_x, ahead_y, length_m, width_m = one
+    ahead, aside = np.array([ahead_x, ahead_y]) * length_m / 2, np.array([-ahead_y, ahead_x]) * width_m / 2
+    return shapely.Polygon(
+        [np.array([x_m, y_m]) + a * ahead + b * aside for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+    )

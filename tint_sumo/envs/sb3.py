@@ -26,8 +26,8 @@ class SceneVecEnv(VecEnv):
     after a collision, ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then; without
     ``autoreset`` it has not, and the environment shows the end of its episode until it is parked or all are reset.
     ``slots`` holds arrays (N, V) of what else is known of the vehicles in the returned observations, and
-    ``terminal_slots`` the same of the terminal one: ``traits``, and with ``tracks`` also ``position_m``, ``gap_m`` and
-    ``passed``.
+    ``terminal_slots`` the same of the terminal one: ``traits``, with ``tracks`` also ``position_m``, ``gap_m`` and
+    ``passed``, and with a sensor that is not perfect what ``SceneEnv`` lists.
     """
 
     slots: dict[str, NDArray[Any]]

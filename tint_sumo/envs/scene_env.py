@@ -44,8 +44,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `vehicles` | `(V, 2)` | x, y of each vehicle's centre minus the ego's, with noise; 0 in empty slots        |
     | `mask`     | `(V,)`   | 1 where the slot holds a vehicle                                                   |
 
-    A vehicle keeps its slot for as long as it is on the roads; a slot stays empty for at least one step between two
-    vehicles. The others' velocities and traits are not observed.
+    A vehicle keeps its slot for as long as it is on the roads and perceived; a slot stays empty for at least one step
+    between two vehicles. The others' velocities and traits are not observed.
 
     ## Rewards
     The sum of named terms, also found in `info["reward_terms"]`:

@@ -76,6 +76,7 @@ def test_the_command_prints_a_page_whose_flags_can_be_copied(
     page = capsys.readouterr().out
     assert len(page.splitlines()) < 40
     assert "traffic lights    1\n" in page
+    assert "not supported     traffic lights: others obey them; the ego sees none" in page
     flags = [line.strip()[1:] for line in page.splitlines() if "--ego-route=" in line]
     assert len(flags) == 3
     assert main(["scene", "check", sumocfg, *shlex.split(flags[0])]) == 0
@@ -92,7 +93,7 @@ def test_the_command_prints_a_page_whose_flags_can_be_copied(
     [
         (["nowhere.sumocfg"], "no file"),
         (["{sumocfg}", "--ego-route", "in", "nowhere", "--goal-m", "9"], "the network has no edge 'nowhere'"),
-        (["{sumocfg}", "--ego-route=in,out"], "--ego-route needs --goal-m"),
+        (["{sumocfg}", "--ego-route=in out"], "--ego-route needs --goal-m"),
         (["{sumocfg}", "--goal-m", "9"], "--start-m and --goal-m are positions on --ego-route"),
         (["{sumocfg}", "--figure", "{sumocfg}"], "must end in"),
         (["{broken}"], "SUMO does not run"),

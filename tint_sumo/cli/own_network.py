@@ -5,17 +5,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from tint_sumo.cli.command import Command, flag_of
-from tint_sumo.cli.values import optional
+from tint_sumo.cli.values import EGO_ROUTE_HELP, edges_of, optional
 from tint_sumo.config import EgoController, SpeedMps, TimeS, WarmStarts, WarmUpS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import Many
 
 _SUMOCFG = optional("FILE", "SUMO configuration in place of a scene: its network, its demand, its vTypes as labels.")
-_ROUTE = optional(
-    "EDGE [EDGE ...]",
-    'Edges that the ego drives along, one after the other; with --sumocfg. With a minus: --ego-route="-E1 -E2".',
-)
+_ROUTE = optional("EDGE [EDGE ...]", f"{EGO_ROUTE_HELP}; with --sumocfg.")
 _START = optional("FLOAT", "Start of the ego's front on its route, m; with --sumocfg.", "0")
 _GOAL = optional("FLOAT", "The ego's front past it on its route, m, is a success; with --sumocfg.")
 _SPEEDS = optional(
@@ -64,7 +61,7 @@ class NetworkCommand(Command):
             raise InputError(f"--sumocfg needs {' and '.join(missing)}: the ego's task in that network")
         from tint_sumo.scenes import from_sumocfg
 
-        given["ego_route"] = [edge for words in given["ego_route"] for edge in words.split()]
+        given["ego_route"] = edges_of(given["ego_route"])
         if "speeds_mps" in given:
             given["controller"] = EgoController(given.pop("speeds_mps"))
         return from_sumocfg(self.sumocfg, **{"start_m": 0.0, **given})

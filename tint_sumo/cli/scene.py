@@ -7,14 +7,12 @@ from typing import Annotated
 from tyro.conf import Positional, Suppress, subcommand
 
 from tint_sumo.cli.command import Command, Outcome, wrote
-from tint_sumo.cli.values import edges_of, optional
+from tint_sumo.cli.values import EGO_ROUTE_HELP, edges_of, optional
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import PICTURE_SUFFIXES, require_output_file
 from tint_sumo.core.structures import Many
 
-_EGO_ROUTE = optional(
-    "EDGE [EDGE ...]", "Edges that the ego drives along, with --goal-m; or EDGE,EDGE,...", "some are suggested"
-)
+_EGO_ROUTE = optional("EDGE [EDGE ...]", f"{EGO_ROUTE_HELP}; with --goal-m.", "some are suggested")
 _START = optional("FLOAT", "Position of the ego's front on its route at the beginning, m.", "0")
 _GOAL = optional("FLOAT", "Position on its route at which the ego has arrived, m.")
 

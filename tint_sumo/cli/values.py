@@ -23,9 +23,12 @@ MixFlag = Many[Fraction]  # one probability, or the two ends of a range
 SCENES = ", ".join(ENV_IDS)
 
 
-def edges_of(words: Sequence[str]) -> tuple[str, ...]:
-    """Return the edges of a route, given in words, or between commas, as ids that begin with a dash must be."""
-    return tuple(edge for word in words for edge in word.split(",") if edge)
+EGO_ROUTE_HELP = 'Edges that the ego drives along, one after the other (with a minus: --ego-route="-E1 -E2")'
+
+
+def edges_of(words: Sequence[str]) -> list[str]:
+    """Return the edges of a route: a word each, or several in a word, as names with a minus in front must be given."""
+    return [edge for word in words for edge in word.split()]
 
 
 def _read_scene(value: Any, where: Where = ()) -> Any:

@@ -78,6 +78,7 @@ class Check:
             "vtypes": {name: asdict(vtype) for name, vtype in self.vtypes.items()},
             "traffic": traffic,
             "turned_off": list(self.config.left_out),
+            "not_supported": _limits(self),
             "routes": [asdict(route) for route in self.routes],
             "passed": self.passed,
         }
@@ -192,8 +193,19 @@ def report(found: Check) -> str:
         lines.append(f"  {made:,} vehicles have vTypes that SUMO makes at run time")
     if found.config.left_out:
         lines.append(f"turned off        {', '.join(found.config.left_out)}")
+    lines += [f"not supported     {limit}" for limit in _limits(found)]
     lines += ["", *_ego_lines(found)]
     return "\n".join(lines)
+
+
+def _limits(found: Check) -> list[str]:
+    """Return what the configuration has that the ego does not know."""
+    limits = []
+    if found.network.traffic_lights:
+        limits.append("traffic lights: others obey them; the ego sees none, and drives through red")
+    if found.traffic.persons:
+        limits.append("persons: the ego neither sees them nor collides with them")
+    return limits
 
 
 def _ego_lines(found: Check) -> list[str]:
@@ -208,9 +220,9 @@ def _ego_lines(found: Check) -> list[str]:
         ]
     if not found.routes:
         return ["ego               meets others at no junction; any edges that follow each other will do as its route"]
-    lines = ["ego               can take one of these routes, for example:"]
+    lines = ["ego               can take one of these routes, for example (flags of this command and of policy train):"]
     for number, route in enumerate(found.routes, 1):
-        edges = shlex.quote(",".join(route.edges))
+        edges = shlex.quote(" ".join(route.edges))
         lines += [
             f"  {number}  --ego-route={edges} --start-m {route.start_m:g} --goal-m {route.goal_m:g}",
             f"     {route.turn} at junction {route.junction} ({route.junction_type}); {route.streams} turns of others "

@@ -12,7 +12,7 @@ import pytest
 from tests.scenes.networks import UserNetwork
 from tint_sumo.config import REWARD_PRESETS
 from tint_sumo.envs.rows import (
-    OUTCOMES,
+    BUILT_IN_OUTCOMES,
     TRACKS,
     TRUTH,
     Scales,
@@ -39,10 +39,20 @@ RULES = TaskRules(goal_m=30.0, step_limit=100, goal=2.5, collision=-2.0, speed_w
 GOAL, BEYOND = 30.0, math.nextafter(30.0, math.inf)
 
 
-def judged(front_m: float, collided: bool, steps: int, speed_mps: float = 2.0) -> tuple[np.ndarray, bool]:
+def judged(
+    front_m: float, collided: bool, steps: int, speed_mps: float = 2.0, *, lost: bool = False
+) -> tuple[np.ndarray, bool]:
     rows = np.zeros(1, row_type(2))
     rows["outcome"] = 3  # of an earlier episode
-    ended = judge(np.array([front_m]), np.array([speed_mps]), np.array([collided]), np.array([steps]), RULES, rows)
+    ended = judge(
+        np.array([front_m]),
+        np.array([speed_mps]),
+        np.array([collided]),
+        np.array([lost]),
+        np.array([steps]),
+        RULES,
+        rows,
+    )
     return rows[0], ended
 
 
@@ -70,6 +80,16 @@ def test_a_step_ends_in_a_collision_before_a_success_before_a_timeout(
     assert row["truncated"] == (outcome == "timeout")
 
 
+@pytest.mark.parametrize("steps", [1, 100])
+def test_an_ego_that_is_lost_has_neither_arrived_nor_run_out_of_time(steps: int) -> None:
+    row, ended = judged(GOAL, False, steps, lost=True)
+    assert ended
+    assert outcome_name(row["outcome"]) == "lost"
+    assert row["truncated"]
+    assert not row["terminated"]
+    assert (row["goal"], row["collision"], row["step"]) == (0.0, 0.0, RULES.step)
+
+
 @pytest.mark.parametrize(
     ("front_m", "collided", "steps", "terms"),
     [
@@ -89,18 +109,21 @@ def test_rows_are_judged_one_by_one() -> None:
     cases = list(product((0.0, BEYOND), (False, True), (1, 100)))
     rows = np.zeros(len(cases), row_type(1))
     front_m, collided, steps = (np.array(part) for part in zip(*cases, strict=True))
-    assert judge(front_m, np.arange(len(cases), dtype=float), collided, steps, RULES, rows)
+    lost = np.zeros(len(cases), bool)
+    assert judge(front_m, np.arange(len(cases), dtype=float), collided, lost, steps, RULES, rows)
     for row, case, speed_mps in zip(rows, cases, range(len(cases)), strict=True):
         alone = judged(*case, speed_mps)[0]
         assert all(row[name] == alone[name] for name in ("outcome", "reward", "terminated", "truncated"))
-    assert {outcome_name(row["outcome"]) for row in rows} == {"", *OUTCOMES}
+    assert {outcome_name(row["outcome"]) for row in rows} == {"", *BUILT_IN_OUTCOMES}
 
 
 def test_the_end_of_any_row_is_returned() -> None:
     for ended in ([False, False], [True, False], [False, True]):
         rows = np.zeros(2, row_type(1))
         still = np.zeros(2)
-        assert judge(still, still, np.array(ended), np.zeros(2, np.int64), RULES, rows) == any(ended)
+        sound, steps = np.zeros(2, bool), np.zeros(2, np.int64)
+        assert judge(still, still, np.array(ended), sound, steps, RULES, rows) == any(ended)
+        assert judge(still, still, sound, np.array(ended), steps, RULES, rows) == any(ended)
 
 
 def boxes(*values: tuple[float, float, float, float]) -> np.ndarray:

@@ -114,6 +114,13 @@ def test_summary() -> None:
     assert Evaluation(cases[2:]).summary()["navigation_time_s"] is None
 
 
+def test_egos_that_were_lost_are_shown_where_there_are_any() -> None:
+    cases = (Case("success", 10.0), Case("lost", 20.0))
+    assert Evaluation(cases).outcomes == ("success", "timeout", "collision", "lost")
+    assert Evaluation(cases).summary()["lost"] == 0.5
+    assert Evaluation(cases[:1]).outcomes == ("success", "timeout", "collision")
+
+
 @pytest.mark.parametrize(("episodes", "seed"), [(0, 0), (-1, 0), (2_000_000, 0), (1, -1), (1, 1001)])
 def test_bad_values_are_refused(episodes: int, seed: int) -> None:
     require_cases(1, 1000)

@@ -15,7 +15,7 @@ from tint_sumo.config import Backend, EgoController
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SumocfgScene
 from tint_sumo.simulation import SumocfgSimulation, make_simulation
-from tint_sumo.simulation.sumocfg import EGO
+from tint_sumo.simulation.ego_way import EGO
 
 Make = Callable[[str], UserNetwork]
 
@@ -304,15 +304,94 @@ def test_there_is_one_simulation_per_process(user_network: Make) -> None:
         make_simulation(2, user_network("merge").scene())
 
 
+def _with(network: UserNetwork, processing: str = "", additional: str = "") -> UserNetwork:
+    """Return the network with more elements in its configuration, and with an additional file."""
+    folder = network.sumocfg.parent
+    (folder / "more.add.xml").write_text(f"<additional>{additional}</additional>")
+    more = f'<additional-files value="more.add.xml"/>{processing}</configuration>'
+    sumocfg = folder / "more.sumocfg"
+    sumocfg.write_text(network.sumocfg.read_text().replace("</configuration>", more))
+    return replace(network, sumocfg=sumocfg)
+
+
 @pytest.mark.parametrize("backend", ["libsumo", "traci"])
-def test_an_ego_that_sumo_teleports_is_an_error(backend: Backend, user_network: Make) -> None:
-    network = _with_standing_vehicle(user_network("merge"), 90.0)
-    text = network.sumocfg.read_text().replace("</configuration>", '<time-to-teleport value="5"/></configuration>')
-    impatient = network.sumocfg.with_name("impatient.sumocfg")
-    impatient.write_text(text)
-    with (
-        begun(replace(network, sumocfg=impatient).scene(), backend=backend) as simulation,
-        pytest.raises(InputError, match=r'SUMO teleports the ego at .* set time-to-teleport to "-1"'),
-    ):
+@pytest.mark.parametrize("more", ["", '<time-to-teleport.remove value="true"/>'])
+def test_an_ego_that_sumo_teleports_or_removes_is_lost(backend: Backend, more: str, user_network: Make) -> None:
+    network = _with(_with_standing_vehicle(user_network("merge"), 90.0), f'<time-to-teleport value="5"/>{more}')
+    with begun(network.scene(), backend=backend) as simulation:
         for _ in drive(simulation, 100, desired_mps=0.0):
-            pass
+            if simulation.egos.lost[0]:
+                break
+        assert simulation.egos.lost[0]
+        assert simulation.egos.front_m[0] < simulation.scene.goal_m
+        simulation.step(np.zeros(1))  # does nothing
+        simulation.reset(0, 2)
+        assert not simulation.egos.lost[0]
+
+
+def test_an_ego_that_a_calibrator_removes_is_lost(user_network: Make) -> None:
+    calibrator = (
+        '<calibrator id="c" edge="out" pos="60" period="10"><flow begin="0" end="3600" vehsPerHour="0"/></calibrator>'
+    )
+    with begun(_with(user_network("merge"), additional=calibrator).scene()) as simulation:
+        for _ in drive(simulation, 800):
+            if simulation.egos.lost[0]:
+                break
+        assert simulation.egos.lost[0]
+
+
+_ROUTERS = {
+    "device": ('<device.rerouting.probability value="1"/><device.rerouting.period value="5"/>', ""),
+    "rerouter": (
+        "",
+        '<rerouter id="r" edges="bottom2C0 C0C1"><interval begin="0" end="3600">'
+        '<destProbReroute id="right1C1" probability="0"/><destProbReroute id="C0right0" probability="1"/>'
+        "</interval></rerouter>",
+    ),
+    "routes": (
+        "",
+        '<route id="other" edges="bottom2C0 C0right0"/><rerouter id="r" edges="bottom2C0"><interval begin="0" '
+        'end="3600"><routeProbReroute id="other"/></interval></rerouter>',
+    ),
+}
+
+
+@pytest.mark.parametrize("router", ["device", "rerouter", "routes"])
+def test_the_ego_keeps_its_route(router: str, user_network: Make) -> None:
+    processing, additional = _ROUTERS[router]
+    grid = user_network("grid")
+    scene = _with(grid, processing, additional).scene(goal_m=90.0, warm_up_s=1.0)
+    roads = set()
+    with begun(scene) as simulation:
+        for _ in drive(simulation, 60):
+            if simulation.egos.lost[0]:
+                break
+            if simulation.egos.front_m[0] < scene.goal_m:
+                roads.add(simulation.connection.vehicle.getRoadID(EGO))
+        assert not simulation.egos.lost[0]
+        assert {road for road in roads if not road.startswith(":")} <= set(grid.ego_route)
+        assert simulation.egos.collided[0] or simulation.egos.front_m[0] > scene.goal_m
+
+
+def test_a_route_that_is_closed_when_the_ego_appears_is_refused(user_network: Make) -> None:
+    closed = (
+        '<rerouter id="r" edges="C0C1"><interval begin="0" end="3600"><closingReroute id="C1B1" disallow="all"/>'
+        "</interval></rerouter>"
+    )
+    with (
+        pytest.raises(InputError, match="no valid route"),
+        begun(_with(user_network("grid"), additional=closed).scene(warm_up_s=1.0)),
+    ):
+        pass
+
+
+def test_an_ego_whose_route_is_changed_to_one_that_leads_elsewhere_is_lost(user_network: Make) -> None:
+    with begun(user_network("grid").scene(warm_up_s=1.0)) as simulation:
+        vehicle = simulation.connection.vehicle
+        vehicle.setRoute(EGO, ("bottom2C0", "C0right0"))
+        for _ in drive(simulation, 5):
+            assert vehicle.getRoute(EGO) == ("bottom2C0", "C0C1", "C1B1", "B1A1")
+        vehicle.setRoute(EGO, ("bottom2C0", "C0right0"))
+        vehicle.moveTo(EGO, "C0right0_0", 5.0)
+        simulation.step(np.zeros(1))
+        assert simulation.egos.lost[0]

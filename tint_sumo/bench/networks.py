@@ -20,7 +20,7 @@ from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.scenes import SumocfgScene, from_sumocfg
 from tint_sumo.scenes.network import sumo_program
 from tint_sumo.simulation import SumocfgSimulation
-from tint_sumo.simulation.sumocfg import EGO
+from tint_sumo.simulation.ego_way import EGO
 
 _WARM_UP_S = 100.0
 _GO, _STAND = 2, 0  # actions

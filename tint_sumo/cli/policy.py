@@ -142,7 +142,6 @@ class EvaluatePolicy(NetworkCommand, SpreadCommand):
     """Read .zip files, which can run any code: for files that you trust alone."""
 
     def run(self) -> Outcome:
-        from tint_sumo.envs.rows import OUTCOMES
         from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.evaluation import evaluate
         from tint_sumo.methods.evaluation_jobs import evaluate_on
@@ -165,7 +164,7 @@ class EvaluatePolicy(NetworkCommand, SpreadCommand):
                 evaluation = evaluate_on(
                     workers, self.model, task, self.episodes, self.seed, allow_pickle=self.allow_pickle
                 )
-        rates = {outcome: evaluation.rate(outcome) for outcome in OUTCOMES}
+        rates = {outcome: evaluation.rate(outcome) for outcome in evaluation.outcomes}
         lines = [
             f"{outcome:9} {percent(rate.value):>5}%  (95 % interval {low}% to {high}%)"
             for outcome, rate in rates.items()

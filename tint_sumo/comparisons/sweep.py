@@ -24,7 +24,7 @@ from tint_sumo.core.progress import Report
 from tint_sumo.core.ranges import require_distinct
 from tint_sumo.core.structures import overlay, plain, require_fields
 from tint_sumo.core.yaml_files import read_list
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.jobs import Workers, executor_of
 from tint_sumo.methods.evaluation import TUNING_SET, require_cases
 from tint_sumo.methods.registry import METHODS, Learned, find_learned, with_shared_trainings
@@ -231,7 +231,7 @@ def _read_table(tests: Sequence[VariantJob]) -> pd.DataFrame:
                     "method": result.method,
                     "seed": result.seed,
                     "p_conservative": tested.conditions.p_conservative.low,
-                    **{outcome: tested.evaluation.rate(outcome).value for outcome in OUTCOMES},
+                    **{outcome: tested.evaluation.rate(outcome).value for outcome in BUILT_IN_OUTCOMES},
                     "navigation_time_s": tested.evaluation.navigation_time_s,
                 }
             )

@@ -251,7 +251,7 @@ class Episodes:
         self.steps += 1
         self._observe(slice(0, len(self.steps)))
         egos = simulation.egos
-        return judge(egos.front_m, egos.speed_mps, egos.collided, self.steps, self._rules, self.rows)
+        return judge(egos.front_m, egos.speed_mps, egos.collided, egos.lost, self.steps, self._rules, self.rows)
 
     @does(StepPart.OBSERVATION)
     def _observe(self, envs: slice) -> None:

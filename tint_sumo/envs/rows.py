@@ -20,9 +20,10 @@ SEEN = ("vehicles", "mask", "traits", "track", "slot", *TRACKS)  # what the sens
 TRUTH = ("track", "slot", "true_mask", "true_vehicles", "true_traits")  # per vehicle slot, if the sensor is not perfect
 SLOT_INFOS = ("traits", *TRACKS, *TRUTH)  # what infos can have for each vehicle slot
 REWARD_TERMS = ("goal", "collision", "speed", "step")
-Outcome = Literal["success", "timeout", "collision"]
+Outcome = Literal["success", "timeout", "collision", "lost"]
 OUTCOMES: tuple[str, ...] = get_args(Outcome)
-GOING_ON, _SUCCESS, _TIMEOUT, COLLISION = range(4)  # numbers of outcomes in rows: positions in OUTCOMES, plus 1
+BUILT_IN_OUTCOMES = OUTCOMES[:3]  # SUMO takes no ego off the roads of built-in scenes
+GOING_ON, _SUCCESS, _TIMEOUT, COLLISION, _LOST = range(5)  # numbers of outcomes in rows: positions in OUTCOMES, plus 1
 BOUND = 2.0  # limit of normalised observations: 40 m, 6 m/s
 
 Rows = NDArray[np.void]  # records (N,) of a row type
@@ -58,6 +59,11 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
 
 
 _OUTCOME_NAMES = np.array(["", *OUTCOMES], object)  # by their numbers in rows
+
+
+def outcomes_in(scene: Scene | SumocfgScene) -> tuple[str, ...]:
+    """Return the outcomes that episodes of a scene can have."""
+    return OUTCOMES if isinstance(scene, SumocfgScene) else BUILT_IN_OUTCOMES
 
 
 def outcome_name(code: int) -> str:
@@ -130,11 +136,19 @@ class TaskRules(NamedTuple):
 
 
 @compiled
-def judge(front_m: Floats, speed_mps: Floats, collided: Bools, steps: Numbers, rules: TaskRules, rows: Rows) -> bool:
+def judge(
+    front_m: Floats,
+    speed_mps: Floats,
+    collided: Bools,
+    lost: Bools,
+    steps: Numbers,
+    rules: TaskRules,
+    rows: Rows,
+) -> bool:
     """Write outcomes and rewards of the step just made (paper IV-A); return whether any episode has ended.
 
     Args:
-        front_m, speed_mps, collided: (N,) of the egos.
+        front_m, speed_mps, collided, lost: (N,) of the egos.
         steps: (N,) since the episodes' start.
     """
     any_ended = False
@@ -144,10 +158,12 @@ def judge(front_m: Floats, speed_mps: Floats, collided: Bools, steps: Numbers, r
             row.outcome = COLLISION
         elif front_m[index] > rules.goal_m:
             row.outcome = _SUCCESS
+        elif lost[index]:
+            row.outcome = _LOST
         else:
             row.outcome = _TIMEOUT if steps[index] >= rules.step_limit else GOING_ON
         row.terminated = row.outcome in (_SUCCESS, COLLISION)
-        row.truncated = row.outcome == _TIMEOUT
+        row.truncated = row.outcome in (_TIMEOUT, _LOST)
         row.goal = rules.goal if row.outcome == _SUCCESS else 0.0
         row.collision = rules.collision if row.outcome == COLLISION else 0.0
         row.speed = 0.0 if row.terminated else rules.speed_weight_per_mps * speed_mps[index]

@@ -66,7 +66,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     ## Episode End
     Termination: the ego passes its goal (`success`; in the T-intersection its centre is at x = 8 m on the upper lane
-    then), or its box touches another vehicle's (`collision`). Truncation: the time limit (`timeout`).
+    then), or its box touches another vehicle's (`collision`). Truncation: the time limit (`timeout`), or,
+    in a SUMO configuration, that SUMO takes the ego off the road (`lost`): it removes or teleports vehicles that have
+    waited for longer than `time-to-teleport`, and calibrators remove them.
 
     ## Information
     | Key            | Content                                                                                     |
@@ -80,7 +82,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `slot`         | simulation's slot with its vehicle; -1 in empty slots                                       |
     | `true_mask`,   | with a sensor: `(V,)` and `(V, 2)`, the simulation's slots as they are, seen or not, with   |
     | `true_vehicles`| their traits in `true_traits`: not to be used by policies                                   |
-    | `outcome`      | `"success"`, `"collision"`, `"timeout"`, or `""` while the episode goes on                  |
+    | `outcome`      | `"success"`, `"collision"`, `"timeout"`, `"lost"`, or `""` while the episode goes on        |
     | `reward_terms` | the reward's named terms (after a step)                                                     |
     | `time_s`       | time since the episode's start                                                              |
     | `is_success`   | at the episode's end: whether the outcome is `"success"`                                    |

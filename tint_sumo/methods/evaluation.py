@@ -12,7 +12,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.statistics import Rate
-from tint_sumo.envs.rows import OUTCOMES, Outcome
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES, OUTCOMES, Outcome
 from tint_sumo.methods.registry import Policy
 
 # Seed of the first case. Training draws its environments' seeds below this number, so no case is ever trained on.
@@ -29,7 +29,7 @@ _STOP = 0  # action of environments whose case is over
 class Case:
     """Result of one episode."""
 
-    outcome: str  # success, timeout or collision
+    outcome: str  # one of OUTCOMES
     time_s: float  # time of its end
     trait: str | None = None  # trait of the driver that was hit
     route: str | None = None  # route of that driver
@@ -43,6 +43,12 @@ class Evaluation:
     """Results of a policy in a number of cases."""
 
     cases: tuple[Case, ...]
+
+    @property
+    def outcomes(self) -> tuple[str, ...]:
+        """The outcomes to show: those of built-in scenes, and ``lost`` where it happened."""
+        happened = {case.outcome for case in self.cases}
+        return tuple(outcome for outcome in OUTCOMES if outcome in BUILT_IN_OUTCOMES or outcome in happened)
 
     def rate(self, outcome: str) -> Rate:
         return Rate(sum(case.outcome == outcome for case in self.cases), len(self.cases))
@@ -61,7 +67,7 @@ class Evaluation:
 
     def summary(self) -> dict[str, Any]:
         """Return rates as fractions with 95 % intervals, mean time and collisions, ready for JSON."""
-        rates = {outcome: self.rate(outcome) for outcome in OUTCOMES}
+        rates = {outcome: self.rate(outcome) for outcome in self.outcomes}
         return {
             **{outcome: rate.value for outcome, rate in rates.items()},
             "intervals": {outcome: list(rate.interval) for outcome, rate in rates.items()},

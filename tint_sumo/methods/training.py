@@ -28,7 +28,7 @@ from tint_sumo.core.provenance import versions
 from tint_sumo.core.structures import plain
 from tint_sumo.core.training_log import log_film, open_log
 from tint_sumo.envs import TaskSettings
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import outcomes_in
 from tint_sumo.methods.checkpoint import make_checkpoint, restore_checkpoint
 from tint_sumo.methods.evaluation import CASE_SEED
 from tint_sumo.methods.registry import Learned, find_learned
@@ -147,7 +147,7 @@ def train_policy(
             venv = training_venv(learned, encoder, p_conservative, settings, scenes, sensor)
             try:
                 with preserved_random_state(), single_threaded():
-                    model = _learn(venv, steps, seed, out, settings, card, film, report)
+                    model = _learn(venv, outcomes_in(scenes[0]), steps, seed, out, settings, card, film, report)
             finally:
                 venv.close()
             if with_zip:
@@ -218,6 +218,7 @@ def training_venv(
 
 def _learn(
     venv: VecEnv,
+    outcomes: tuple[str, ...],
     steps: int,
     seed: int,
     out: Path,
@@ -232,10 +233,10 @@ def _learn(
     recent = restore_checkpoint(out, model)
     done = model.num_timesteps
     logged = {key: card[key] for key in ("method", "p_conservative", "scene", "seed", "steps", "settings")}
-    model.set_logger(open_log(out, logged, [f"rollout/{outcome}" for outcome in OUTCOMES], done))
+    model.set_logger(open_log(out, logged, [f"rollout/{outcome}" for outcome in outcomes], done))
     if done < steps:
         report(Progress(done, steps, "step"))
-        watch = _Watch(out, steps, card, film, report, recent)
+        watch = _Watch(out, outcomes, steps, card, film, report, recent)
         try:
             model.learn(steps - done, callback=watch, reset_num_timesteps=False)
         except KeyboardInterrupt:
@@ -298,6 +299,7 @@ class _Watch(BaseCallback):
     def __init__(
         self,
         out: Path,
+        outcomes: tuple[str, ...],
         steps: int,
         card: Mapping[str, Any],
         film: FilmMaker | None,
@@ -306,6 +308,7 @@ class _Watch(BaseCallback):
     ) -> None:
         super().__init__()
         self._out = out
+        self._outcomes = outcomes
         self._steps = steps
         self._card = card
         self._film = film
@@ -344,7 +347,7 @@ class _Watch(BaseCallback):
 
     def _write_curve(self) -> None:
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([("decisions", *OUTCOMES), *self._curve])
+        csv.writer(text, lineterminator="\n").writerows([("decisions", *self._outcomes), *self._curve])
         write_text(self._out / CURVE_FILE, text.getvalue())
 
     def _on_step(self) -> bool:
@@ -355,7 +358,7 @@ class _Watch(BaseCallback):
     def _on_rollout_end(self) -> None:
         measures: dict[str, float] = {}
         if self._recent:
-            shares = {outcome: self._recent.count(outcome) / len(self._recent) for outcome in OUTCOMES}
+            shares = {outcome: self._recent.count(outcome) / len(self._recent) for outcome in self._outcomes}
             for outcome, share in shares.items():
                 self.logger.record(f"rollout/{outcome}", share)
             self._curve.append([str(self.num_timesteps), *(f"{share:.4f}" for share in shares.values())])

@@ -39,6 +39,7 @@ class Connection:
     vehicle: Any
     vehicletype: Any
     person: Any
+    lane: Any
     route: Any
     polygon: Any
     simulation: Any
@@ -102,6 +103,7 @@ def _libsumo(options: Sequence[str]) -> Connection:
                 libsumo.vehicle,
                 libsumo.vehicletype,
                 libsumo.person,
+                libsumo.lane,
                 libsumo.route,
                 libsumo.polygon,
                 libsumo.simulation,
@@ -152,6 +154,7 @@ def _traci(options: Sequence[str]) -> Connection:
                 connection.vehicle,
                 connection.vehicletype,
                 connection.person,
+                connection.lane,
                 connection.route,
                 connection.polygon,
                 connection.simulation,

@@ -55,6 +55,7 @@ class Egos:
     ``distance_m``  (R, V)  from its box to the vehicles' boxes; infinite if far, or in empty slots
     ``unsafe``      (R,)    result of the safety check for the next step
     ``collision``   R items the first collision in the episode, or None
+    ``lost``        (R,)    SUMO has taken the ego off the road, or off its route
     =============== ======= ======================================================================
     """
 
@@ -73,6 +74,7 @@ class Egos:
         self.unsafe: Bools = np.zeros(replicas, bool)
         self._hit_slot: Numbers = np.full(replicas, NO_VEHICLE)
         self.collision: list[Collision | None] = [None] * replicas
+        self.lost: Bools = np.zeros(replicas, bool)
 
     @property
     def collided(self) -> Bools:
@@ -84,7 +86,7 @@ class Egos:
         self.front_m[replica] = self.speed_mps[replica] = 0.0
         self.box[replica] = self._nowhere[0]
         self.distance_m[replica] = self._was_distance_m[replica] = np.inf
-        self.unsafe[replica] = False
+        self.unsafe[replica] = self.lost[replica] = False
         self._hit_slot[replica] = NO_VEHICLE
         self.collision[replica] = None
 

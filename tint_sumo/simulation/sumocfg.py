@@ -21,13 +21,14 @@ from tint_sumo.scenes.sumo_config import DEFAULT_VTYPE, SumoConfig, base_vtype
 from tint_sumo.scenes.sumo_run import SumocfgRun
 from tint_sumo.scenes.sumocfg import SumocfgScene, network_roads
 from tint_sumo.simulation.connection import Connection, connect
+from tint_sumo.simulation.ego_way import EGO, EgoWay, Fate
 from tint_sumo.simulation.refusals import Refusals
 from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.simulation.sumo import SPEED_MODE_OBEY_SETSPEED
 from tint_sumo.simulation.warm_starts import WarmStarts
 
-EGO = "tint_sumo.ego"  # vehicle, vType and route; no user's id
 _ONLY_STRATEGIC_CHANGES = 513  # lane changes: those that the route asks for, where there is room
+_REROUTING = "has.rerouting.device"
 _ENTRY_PATIENCE_S = 60.0  # the ego waits for room at its start for so long
 _SEEN = (constants.VAR_POSITION, constants.VAR_ANGLE, constants.VAR_DISTANCE, constants.VAR_SPEED)
 _AROUND_M = (30.0, 20.0)  # pictures show so much to each side of the ego
@@ -144,6 +145,7 @@ class SumocfgSimulation(Simulation):
             self._define_ego()
             self._let_ego_enter()
             self.connection.vehicle.subscribeContext(EGO, constants.CMD_GET_VEHICLE_VARIABLE, self.scene.sight_m, _SEEN)
+            self._way = EgoWay(self.connection, self.scene.departure[0])
             sight = self.connection.vehicle.getContextSubscriptionResults(EGO)[EGO]
         self._drives = True
         x_m, y_m, *_ = _box(sight, self._ego_size_m, (0.0, 0.0))
@@ -176,6 +178,7 @@ class SumocfgSimulation(Simulation):
         types.setMinGap(EGO, 0.0)
         types.setMaxSpeed(EGO, max(scene.controller.desired_speeds_mps) + 1.0)
         types.setSpeedDeviation(EGO, 0.0)
+        types.setParameter(EGO, _REROUTING, "false")
         self.connection.route.add(EGO, list(scene.departure[0]))
 
     def _let_ego_enter(self) -> None:
@@ -201,7 +204,7 @@ class SumocfgSimulation(Simulation):
         """Advance by one step; (1,) desired speed of the ego.
 
         Raises:
-            InputError: SUMO finds fault with the demand, or teleports the ego.
+            InputError: SUMO finds fault with the demand.
         """
         if not self._drives:
             return
@@ -209,17 +212,24 @@ class SumocfgSimulation(Simulation):
         with self._refusals:
             self.connection.vehicle.setSpeed(EGO, float(self.egos.speed_mps[0]))
             self.connection.step()
-        self._look()
+            fate = self._way.look(float(self.egos.speed_mps[0]) * self.scene.step_s)
+        if fate is Fate.DRIVES:
+            self._look()
+        else:
+            self._end(fate)
+
+    def _end(self, fate: Fate) -> None:
+        """Leave all as it was at last: the ego has come to its route's end, or SUMO has taken it away."""
+        self._drives = False
+        if fate is Fate.ARRIVED:
+            self.egos.front_m[0] = np.inf
+        else:
+            self.egos.lost[0] = True
 
     def _look(self) -> None:
         """Take over from SUMO where the ego and the vehicles in its sight are."""
-        self._require_ego_on_road()
         seen = dict(self.connection.vehicle.getContextSubscriptionResults(EGO))
-        ego = seen.pop(EGO, None)
-        if ego is None:  # it has come to its route's end
-            self._drives = False
-            self.egos.front_m[0] = np.inf
-            return
+        ego = seen.pop(EGO)
         self.egos.front_m[0] = self.scene.start_m + ego[constants.VAR_DISTANCE]
         self.egos.speed_mps[0] = ego[constants.VAR_SPEED]
         self.egos.box[0] = _box(ego, self._ego_size_m, self.origin_m)
@@ -253,15 +263,6 @@ class SumocfgSimulation(Simulation):
             self.slots.take(0, slot, member=kind.member, number=number, size_m=kind.size_m)
             self.slot[vehicle_id] = slot
         return slot
-
-    def _require_ego_on_road(self) -> None:
-        """Raise InputError where SUMO puts the ego elsewhere because it has waited for long: standing would pay off."""
-        simulation = self.connection.simulation
-        if EGO in simulation.getStartingTeleportIDList():
-            raise InputError(
-                f"SUMO teleports the ego at {simulation.getTime():g} s, because it has waited for long; set "
-                f'time-to-teleport to "-1" in {self.scene.config.file}, or to more than the episodes take'
-            )
 
     def _road_of(self, replica: int, slot: int) -> str:  # noqa: ARG002 - there is but one
         vehicle_id = next(known for known, taken in self.slot.items() if taken == slot)

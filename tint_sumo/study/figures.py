@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from tint_sumo.core.files import whole_file
 from tint_sumo.core.percentages import percent
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import METHODS, look_of
 from tint_sumo.study.jobs import smoothed_percent
 from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, varied
@@ -53,7 +53,7 @@ def _titles(rows: Sequence[Summary]) -> list[str]:
 def _plot_panel(axes: Axes, rows: Sequence[Summary]) -> None:
     positions = range(len(rows))
     left = [0.0] * len(rows)
-    for outcome in OUTCOMES:
+    for outcome in BUILT_IN_OUTCOMES:
         widths = [100.0 * row.rate(outcome) for row in rows]
         axes.barh(positions, widths, 0.72, left=left, color=COLOURS[outcome], label=outcome)
         for row, position, start, width in zip(rows, positions, left, widths, strict=True):

@@ -12,7 +12,7 @@ from tint_sumo.core.files import damaged, write_json
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Report, part_of
 from tint_sumo.core.reading import RESULT_BYTES, require_file
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
 from tint_sumo.methods.evaluation import REPORTED_SET, Evaluation, evaluate
 from tint_sumo.methods.loading import load_policy
@@ -214,10 +214,10 @@ def smoothed_percent(seeds: Sequence[pd.DataFrame]) -> pd.DataFrame:
 def _read_curve(file: Path) -> pd.DataFrame:
     require_file(file, "training curve", RESULT_BYTES)
     try:
-        curve = pd.read_csv(file, dtype=float, compression=None)[["decisions", *OUTCOMES]]
+        curve = pd.read_csv(file, dtype=float, compression=None)[["decisions", *BUILT_IN_OUTCOMES]]
     except (KeyError, ValueError, OverflowError) as error:
         raise damaged(file, "training curve", " ".join(str(error).split())) from None
-    decisions, shares = curve["decisions"], curve[list(OUTCOMES)]
+    decisions, shares = curve["decisions"], curve[list(BUILT_IN_OUTCOMES)]
     if not (decisions.between(0, 1e12).all() and decisions.is_monotonic_increasing and decisions.is_unique):
         raise damaged(file, "training curve", "decisions must grow from 0 on")
     if not ((shares >= 0.0) & (shares <= 1.0)).all(axis=None):

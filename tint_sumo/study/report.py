@@ -8,7 +8,7 @@ from pathlib import Path
 from tint_sumo.core.files import write_text
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.statistics import difference_interval
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.study.ceiling_job import read_ceilings
 from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves
 from tint_sumo.study.jobs import read_curves
@@ -110,14 +110,14 @@ def _success_lines(rows: Sequence[Summary], ceilings: Ceilings) -> Lines:
 
 
 def _outcome_lines(rows: Sequence[Summary]) -> Lines:
-    lines = [["P", "method", *(f"{outcome} %" for outcome in OUTCOMES), "time s", "cases", "seeds", "paper %"]]
+    lines = [["P", "method", *(f"{outcome} %" for outcome in BUILT_IN_OUTCOMES), "time s", "cases", "seeds", "paper %"]]
     for row in rows:
         time_s = row.navigation_time_s
         lines.append(
             [
                 _mix(row),
                 row.title,
-                *(_with_interval(row, outcome) for outcome in OUTCOMES),
+                *(_with_interval(row, outcome) for outcome in BUILT_IN_OUTCOMES),
                 "-" if time_s is None else f"{time_s:.1f}",
                 str(row.episodes),
                 ", ".join(map(str, row.seeds)),

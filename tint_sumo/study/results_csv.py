@@ -10,7 +10,7 @@ from tint_sumo.config import Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.reading import RESULT_BYTES, read_file
 from tint_sumo.core.statistics import Interval
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.summary import Summary
 
@@ -20,9 +20,9 @@ _PARTS = ("", "_low", "_high", "_sd")  # a rate, the ends of its interval, its s
 _CONDITIONS = ("p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent")
 COLUMNS = (
     *("method", "origin", "trained_p_conservative", *_CONDITIONS),
-    *(f"{outcome}{part}_percent" for outcome in OUTCOMES for part in _PARTS),
+    *(f"{outcome}{part}_percent" for outcome in BUILT_IN_OUTCOMES for part in _PARTS),
     *("navigation_time_s", "episodes", "seeds", "ceiling_percent"),
-    *(f"paper_{outcome}_percent" for outcome in OUTCOMES),
+    *(f"paper_{outcome}_percent" for outcome in BUILT_IN_OUTCOMES),
 )
 
 
@@ -66,7 +66,7 @@ def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
         p = conditions.p_conservative
         ceiling = ceilings.get(p.low) if p.is_single else None
         numbers: list[str] = []
-        for outcome in OUTCOMES:
+        for outcome in BUILT_IN_OUTCOMES:
             numbers += (_percent(part) for part in (row.rate(outcome), *row.intervals[outcome], row.spread(outcome)))
         writer.writerow(
             [
@@ -77,7 +77,7 @@ def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
                 row.episodes,
                 " ".join(map(str, row.seeds)),
                 _percent(ceiling),
-                *(row.published.get(outcome, "") for outcome in OUTCOMES),
+                *(row.published.get(outcome, "") for outcome in BUILT_IN_OUTCOMES),
             ]
         )
     return text.getvalue()
@@ -104,7 +104,7 @@ def read_csv(file: Path) -> tuple[list[StoredRow], dict[float, float]]:
 
 def _row(line: Mapping[str, str]) -> StoredRow:
     rates, limits, spreads = {}, {}, {}
-    for outcome in OUTCOMES:
+    for outcome in BUILT_IN_OUTCOMES:
         rate, low, high, spread = (line[f"{outcome}{part}_percent"] for part in _PARTS)
         rates[outcome], limits[outcome] = _read_percent(rate), (_read_percent(low), _read_percent(high))
         spreads[outcome] = _read_percent(spread) if spread else None

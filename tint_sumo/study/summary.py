@@ -11,7 +11,7 @@ import numpy as np
 
 from tint_sumo.config import Mix
 from tint_sumo.core.statistics import Hits, Interval, rate_interval
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.evaluation import Evaluation
 from tint_sumo.methods.registry import METHODS, Learned
 from tint_sumo.study.budgets import Conditions
@@ -81,7 +81,7 @@ class Summary(ABC):
         if not self.conditions.is_single_mix:
             return {}
         p_conservative = self.conditions.p_conservative.low
-        return dict(zip(OUTCOMES, RATES_PERCENT.get((self.method, p_conservative), ()), strict=False))
+        return dict(zip(BUILT_IN_OUTCOMES, RATES_PERCENT.get((self.method, p_conservative), ()), strict=False))
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ class Row(Summary):
     @cached_property
     def intervals(self) -> dict[str, Interval]:
         if len(self.seeds) == 1:
-            return {outcome: self.evaluations[0].rate(outcome).interval for outcome in OUTCOMES}
-        return {outcome: rate_interval(self.hits(outcome)) for outcome in OUTCOMES}
+            return {outcome: self.evaluations[0].rate(outcome).interval for outcome in BUILT_IN_OUTCOMES}
+        return {outcome: rate_interval(self.hits(outcome)) for outcome in BUILT_IN_OUTCOMES}
 
     @property
     def navigation_time_s(self) -> float | None:
@@ -134,7 +134,7 @@ class Row(Summary):
             "percent": self.conditions.percent,
             "seeds": list(self.seeds),
             "episodes": self.episodes,
-            **{outcome: self.rate(outcome) for outcome in OUTCOMES},
+            **{outcome: self.rate(outcome) for outcome in BUILT_IN_OUTCOMES},
             "intervals": {outcome: list(interval) for outcome, interval in self.intervals.items()},
             "success_sd": self.spread("success"),
             "navigation_time_s": self.navigation_time_s,

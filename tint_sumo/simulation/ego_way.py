@@ -1,0 +1,75 @@
+"""The ego's way through a SUMO configuration: it keeps its route, and is lost where SUMO takes it off.
+
+SUMO can remove or teleport a vehicle that has waited for long, and calibrators, for example, remove vehicles, too. All
+of them vanish like one that has come to the end of its route. Rerouters and rerouting devices give vehicles other
+routes.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from enum import Enum, auto
+from typing import Any
+
+from libsumo import constants
+
+from tint_sumo.simulation.connection import SUMO_ERRORS, Connection
+
+EGO = "tint_sumo.ego"  # vehicle, vType and route; no user's id
+# SUMO takes a vehicle for arrived within 0.1 m; a position that it gives can be rounded.
+_ARRIVAL_M = 0.2
+_JUNCTION = ":"  # edges on junctions begin so
+
+
+class Fate(Enum):
+    """What became of the ego in a step."""
+
+    DRIVES = auto()
+    ARRIVED = auto()  # at the end of its route
+    LOST = auto()  # removed, teleported, or without a way back to its route
+
+
+class EgoWay:
+    """Watches the ego in a running simulation; made when it has departed on its route.
+
+    Args:
+        connection: the simulation.
+        edges: the ego's route.
+    """
+
+    def __init__(self, connection: Connection, edges: Sequence[str]) -> None:
+        self._connection = connection
+        self._edges = tuple(edges)
+        self._end_m = float(connection.lane.getLength(f"{edges[-1]}_0"))
+        connection.vehicle.subscribe(EGO, (constants.VAR_ROUTE_ID, constants.VAR_ROAD_ID))
+        found = connection.vehicle.getSubscriptionResults(EGO)
+        self._route_id = EGO
+        self._number = 0  # of the edge that the ego has come to
+        self._left_m = math.inf  # from there to the route's end
+        self._is_on(found)
+
+    def look(self, moved_m: float) -> Fate:
+        """Return what became of the ego in a step of this length; put it back on its route if it was rerouted."""
+        found = self._connection.vehicle.getSubscriptionResults(EGO)
+        if EGO in self._connection.simulation.getStartingTeleportIDList():
+            return Fate.LOST
+        if not found:
+            return Fate.ARRIVED if moved_m >= self._left_m - _ARRIVAL_M else Fate.LOST
+        return Fate.DRIVES if self._is_on(found) else Fate.LOST
+
+    def _is_on(self, found: Mapping[int, Any]) -> bool:
+        """Return whether the ego is on its route, and goes on there."""
+        edge = found[constants.VAR_ROAD_ID]
+        if edge != self._edges[self._number] and not edge.startswith(_JUNCTION):
+            if edge not in self._edges[self._number :]:
+                return False
+            self._number = self._edges.index(edge, self._number)
+        vehicle = self._connection.vehicle
+        if found[constants.VAR_ROUTE_ID] != self._route_id:
+            try:
+                vehicle.setRoute(EGO, self._edges[self._number :])
+            except SUMO_ERRORS:  # such as an edge ahead that a rerouter has closed
+                return False
+            self._route_id = vehicle.getRouteID(EGO)
+        left_m = vehicle.getDrivingDistance(EGO, self._edges[-1], self._end_m)
+        self._left_m = left_m if left_m >= 0.0 else math.inf
+        return True

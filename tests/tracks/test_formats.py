@@ -227,6 +227,24 @@ def test_spaces_and_a_byte_order_mark_do_not_matter(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(read_tracks(file).table, table)
 
 
+@pytest.mark.parametrize("name", FILES.keys() - {"commonroad"})
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_other_separators_are_read(tmp_path: Path, name: str, separator: str) -> None:
+    file = FILES[name](tmp_path)
+    table = read_tracks(file).table
+    write_text(file, file.read_text().replace(",", separator))
+    pd.testing.assert_frame_equal(read_tracks(file).table, table)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be"])
+@pytest.mark.parametrize("name", FILES)
+def test_another_encoding_is_named(tmp_path: Path, name: str, encoding: str) -> None:
+    file = FILES[name](tmp_path)
+    file.write_bytes(f"\ufeff{file.read_text()}".encode(encoding))
+    with pytest.raises(InputError, match=r"is text in UTF-16; save it in UTF-8"):
+        read_tracks(file)
+
+
 def test_commas_stand_between_thousands_only(tmp_path: Path) -> None:
     file = ngsim(tmp_path)
     table = read_tracks(file).table

@@ -71,7 +71,7 @@ def _in_metres(
 
 
 def _is_fcd(head: Head) -> bool:
-    is_table = is_fcd_table(head.text.partition("\n")[0])
+    is_table = is_fcd_table(head.first_line)
     return "<fcd-export" in head.text or is_table or head.file.suffix == ".parquet"
 
 

@@ -1,5 +1,6 @@
 """Finds the format of a file and reads its tracks. Each format is one module, imported in ``tint_sumo.tracks``."""
 
+import codecs
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from tint_sumo.tracks.schema import Tracks, build_tracks
 
 _HEAD_BYTES = 4096  # of a file, from which its format is recognised
 _ROLE = "tracks"
+_SEPARATORS = (",", ";", "\t")
 _THOUSANDS = r"-?\d{1,3}(,\d{3})+(\.\d*)?"  # a comma before other digits may be a decimal one
 
 
@@ -27,10 +29,18 @@ class Head:
     text: str
 
     @property
+    def first_line(self) -> str:
+        return next(iter(self.text.lstrip("\ufeff").splitlines()), "")
+
+    @property
+    def separator(self) -> str:
+        """The separator of a CSV file: comma, semicolon or tab, whichever its first line has most of."""
+        return max(_SEPARATORS, key=self.first_line.count)
+
+    @property
     def columns(self) -> frozenset[str]:
         """Names in the first line of a CSV file, in lower case."""
-        first = self.text.lstrip("\ufeff").partition("\n")[0]
-        return frozenset(name.strip().strip('"').lower() for name in first.split(","))
+        return frozenset(name.strip().strip('"').lower() for name in self.first_line.split(self.separator))
 
 
 @dataclass(frozen=True)
@@ -107,7 +117,10 @@ def recording_name(file: Path) -> str:
 
 def _head(file: Path) -> Head:
     with opened(file) as content:
-        return Head(file, content.read(_HEAD_BYTES).decode("utf-8", "replace"))
+        head = content.read(_HEAD_BYTES)
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise InputError(f"{file} is text in UTF-16; save it in UTF-8")
+    return Head(file, head.decode("utf-8", "replace"))
 
 
 def read_columns_of(file: Path) -> frozenset[str]:
@@ -133,9 +146,12 @@ def read_csv(file: Path, numbers: Sequence[str], texts: Sequence[str] = ()) -> p
     Raises:
         InputError: the file is damaged, has no rows, lacks columns, or holds something else where a number belongs.
     """
+    separator = _head(file).separator
     try:
         with opened(file) as content:
-            rows = pd.read_csv(content, dtype=str, encoding="utf-8-sig", skipinitialspace=True, na_filter=False)
+            rows = pd.read_csv(
+                content, sep=separator, dtype=str, encoding="utf-8-sig", skipinitialspace=True, na_filter=False
+            )
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise InputError(f"{file} is not a whole CSV file ({' '.join(str(error).split())}); get it again") from None
     if not isinstance(rows.index, pd.RangeIndex):  # pandas takes the first values for names of rows

@@ -229,3 +229,30 @@ def test_a_vehicle_that_has_just_appeared_was_infinitely_far() -> None:
     assert np.isinf(egos._was_distance_m[0, 0])
     egos.look_around(slots)
     assert egos._was_distance_m[0, 0] == egos.distance_m[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("step_s", "number", "hit"),
+    [(1.0, 0, True), (0.5, 0, True), (0.1, 0, False), (1.0, 1, False)],
+    ids=["long step", "half a second", "short step", "another vehicle"],
+)
+def test_a_vehicle_cannot_pass_through_an_ego_within_a_long_step(step_s: float, number: int, hit: bool) -> None:
+    egos, slots = Egos(1, replace(T, step_s=step_s)), Slots(1, T.max_vehicles)
+    egos.box[0] = (0.0, 0.0, 0.0, 1.0, 5.0, 2.0)
+    slots.take(0, 2, member=0, number=0, size_m=(5.0, 2.0))
+    slots.box[0, 2] = (-6.0, 0.0, 1.0, 0.0, 5.0, 2.0)
+    assert not egos.look_around(slots)
+    slots.vehicle_number[0, 2] = number
+    slots.box[0, 2] = (6.0, 0.0, 1.0, 0.0, 5.0, 2.0)
+    assert list(egos.look_around(slots)) == ([(0, 2)] if hit else [])
+    assert egos.distance_m[0, 2] == pytest.approx(2.5)
+    assert egos.collided[0] == hit
+
+
+def test_a_vehicle_that_keeps_clear_of_an_ego_in_a_long_step_is_not_hit() -> None:
+    egos, slots = Egos(1, replace(T, step_s=1.0)), Slots(1, T.max_vehicles)
+    egos.box[0] = (0.0, 0.0, 0.0, 1.0, 5.0, 2.0)
+    slots.take(0, 2, member=0, number=0, size_m=(5.0, 2.0))
+    for x_m in (-6.0, 6.0):
+        slots.box[0, 2] = (x_m, 3.6, 1.0, 0.0, 5.0, 2.0)
+        assert not egos.look_around(slots)

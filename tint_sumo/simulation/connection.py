@@ -40,6 +40,7 @@ class Connection:
     vehicletype: Any
     person: Any
     lane: Any
+    edge: Any
     route: Any
     polygon: Any
     simulation: Any
@@ -104,6 +105,7 @@ def _libsumo(options: Sequence[str]) -> Connection:
                 libsumo.vehicletype,
                 libsumo.person,
                 libsumo.lane,
+                libsumo.edge,
                 libsumo.route,
                 libsumo.polygon,
                 libsumo.simulation,
@@ -155,6 +157,7 @@ def _traci(options: Sequence[str]) -> Connection:
                 connection.vehicletype,
                 connection.person,
                 connection.lane,
+                connection.edge,
                 connection.route,
                 connection.polygon,
                 connection.simulation,

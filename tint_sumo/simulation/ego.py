@@ -8,11 +8,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tint_sumo.core.compiling import compiled
-from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers, measure_distances_m, new_boxes
+from tint_sumo.scenes.geometry import (
+    BOX,
+    NO_VEHICLE,
+    Bools,
+    Boxes,
+    Floats,
+    Numbers,
+    clearance_m,
+    measure_distances_m,
+    new_boxes,
+)
 from tint_sumo.scenes.scene import Scene
 from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation.slots import Slots
 from tint_sumo.simulation.timing import StepPart, does
+
+_SHORT_STEP_S = 0.1  # in which boxes at both ends are enough
 
 
 @dataclass(frozen=True)
@@ -73,6 +85,11 @@ class Egos:
         self._was_distance_m: Floats = np.full((replicas, scene.max_vehicles), np.inf)  # distances one step ago
         self.unsafe: Bools = np.zeros(replicas, bool)
         self._hit_slot: Numbers = np.full(replicas, NO_VEHICLE)
+        # In a long step, vehicles can pass through each other unless their boxes are swept from its begin to its end.
+        self._parts = round(scene.step_s / _SHORT_STEP_S)
+        self._was_box: Boxes = self.box.copy()
+        self._were: Boxes = np.zeros((replicas, scene.max_vehicles), BOX)
+        self._was_number: Numbers = np.full((replicas, scene.max_vehicles), NO_VEHICLE)
         self.collision: list[Collision | None] = [None] * replicas
         self.lost: Bools = np.zeros(replicas, bool)
 
@@ -88,6 +105,7 @@ class Egos:
         self.distance_m[replica] = self._was_distance_m[replica] = np.inf
         self.unsafe[replica] = self.lost[replica] = False
         self._hit_slot[replica] = NO_VEHICLE
+        self._was_number[replica] = NO_VEHICLE
         self.collision[replica] = None
 
     def drive(self, desired_mps: Floats) -> None:
@@ -99,12 +117,24 @@ class Egos:
         """Run the safety check for the next step; return replica and slot of each episode's first collision."""
         self.distance_m, self._was_distance_m = self._was_distance_m, self.distance_m
         measure_distances_m(self.box, slots.present, slots.box, self._reach_m, self.distance_m)
-        if not check_safety(
+        any_new = check_safety(
             self.distance_m, self._was_distance_m, self.box, slots.box, self._rules, self.unsafe, self._hit_slot
-        ):
+        )
+        if self._parts > 1:
+            any_new |= self._sweep(slots)
+        if not any_new:
             return ()
         collided = np.flatnonzero(self.collided).tolist()
         return [(replica, int(self._hit_slot[replica])) for replica in collided if self.collision[replica] is None]
+
+    def _sweep(self, slots: Slots) -> bool:
+        """Look for collisions within the step just made; return whether there is a new one."""
+        same = slots.present & (slots.vehicle_number == self._was_number)
+        any_new = sweep(self._was_box, self.box, same, self._were, slots.box, self._parts, self._hit_slot)
+        np.copyto(self._was_box, self.box)
+        np.copyto(self._were, slots.box)
+        np.copyto(self._was_number, slots.vehicle_number)
+        return any_new
 
 
 @compiled
@@ -166,6 +196,46 @@ def check_safety(
                 hit[row] = slot
                 any_new = True
     return any_new
+
+
+@compiled
+def sweep(
+    egos_before: Boxes, egos: Boxes, same: Bools, before: Boxes, vehicles: Boxes, parts: int, hit: Numbers
+) -> bool:
+    """Write which vehicles egos have touched between two steps, if all drive straight on at a constant speed.
+
+    Args:
+        egos_before, egos: (R,) boxes.
+        same: (R, V) slots with the same vehicle at both times.
+        before, vehicles: (R, V) boxes.
+        parts: of the step, at whose ends within it boxes are compared.
+        hit: (R,) the first slot whose vehicle the ego has touched, written where it was negative.
+
+    Returns:
+        whether any ego has touched a vehicle for the first time.
+    """
+    any_new = False
+    ego, vehicle = egos[:1].copy(), egos[:1].copy()
+    for row in range(len(egos)):
+        for part in range(1, parts):
+            share = part / parts
+            between(egos_before[row], egos[row], share, ego[0])
+            for slot in range(same.shape[1]):
+                if hit[row] < 0 and same[row, slot]:
+                    between(before[row, slot], vehicles[row, slot], share, vehicle[0])
+                    if clearance_m(ego[0], vehicle[0]) == 0.0:
+                        hit[row] = slot
+                        any_new = True
+    return any_new
+
+
+@compiled
+def between(first: Any, last: Any, share: float, box: Any) -> None:
+    """Write the box at a share of the way from one box to another, whose heading it has."""
+    box.x_m = first.x_m + share * (last.x_m - first.x_m)
+    box.y_m = first.y_m + share * (last.y_m - first.y_m)
+    box.heading_x, box.heading_y = last.heading_x, last.heading_y
+    box.length_m, box.width_m = last.length_m, last.width_m
 
 
 @compiled

@@ -20,6 +20,7 @@ from tint_sumo.scenes.scene import BUILDING, Building, View
 from tint_sumo.scenes.sumo_config import DEFAULT_VTYPE, SumoConfig, base_vtype
 from tint_sumo.scenes.sumo_run import SumocfgRun
 from tint_sumo.scenes.sumocfg import SumocfgScene, network_roads
+from tint_sumo.simulation.bodies import LONG_M, Bodies, Box
 from tint_sumo.simulation.connection import Connection, connect
 from tint_sumo.simulation.ego_way import EGO, EgoWay, Fate
 from tint_sumo.simulation.refusals import Refusals
@@ -30,7 +31,14 @@ from tint_sumo.simulation.warm_starts import WarmStarts
 _ONLY_STRATEGIC_CHANGES = 513  # lane changes: those that the route asks for, where there is room
 _REROUTING = "has.rerouting.device"
 _ENTRY_PATIENCE_S = 60.0  # the ego waits for room at its start for so long
-_SEEN = (constants.VAR_POSITION, constants.VAR_ANGLE, constants.VAR_DISTANCE, constants.VAR_SPEED)
+_SEEN = (
+    *(constants.VAR_POSITION3D, constants.VAR_ANGLE, constants.VAR_DISTANCE, constants.VAR_SPEED),
+    constants.VAR_STOPSTATE,
+)
+_PARKS = 2  # bit of the stop state
+# Vehicles on a bridge, or under it, are so much higher or lower than the ego: a storey and, since roads may climb, a
+# share of their distance.
+_LEVEL_M, _SLOPE = 3.0, 0.1
 _AROUND_M = (30.0, 20.0)  # pictures show so much to each side of the ego
 
 Sight = Mapping[int, Any]  # a vehicle's variables of _SEEN
@@ -80,7 +88,7 @@ class Kinds:
 
 def _box(sight: Sight, size_m: tuple[float, float], origin_m: tuple[float, float]) -> tuple[float, ...]:
     """Return a vehicle's box, a record; SUMO gives its front, and its angle from north."""
-    x_m, y_m = sight[constants.VAR_POSITION]
+    x_m, y_m, _ = sight[constants.VAR_POSITION3D]
     angle_rad = math.radians(sight[constants.VAR_ANGLE])  # clockwise
     heading_x, heading_y = math.sin(angle_rad), math.cos(angle_rad)
     half_m = size_m[0] / 2
@@ -115,6 +123,10 @@ class SumocfgSimulation(Simulation):
             self.connection = connect(self._run.options(seed=0), backend)
         self.warm_starts = WarmStarts(scene, self.connection, self._run)
         self._kinds = Kinds(scene.config, scene.vtypes, self.connection)
+        self._bodies = Bodies(self.connection)
+        self._pieces: dict[str, Box] = {}  # of long vehicles, those nearest to the ego, in the network's frame
+        self._known_vtypes = 0
+        self._any_long = False
         self._drives = False
         self.slot: dict[str, int] = {}
         self._number: dict[str, int] = {}  # number of each vehicle that has been seen
@@ -144,7 +156,7 @@ class SumocfgSimulation(Simulation):
             self.warm_starts.begin(seed)
             self._define_ego()
             self._let_ego_enter()
-            self.connection.vehicle.subscribeContext(EGO, constants.CMD_GET_VEHICLE_VARIABLE, self.scene.sight_m, _SEEN)
+            self._look_as_far_as_needed()
             self._way = EgoWay(self.connection, self.scene.departure[0])
             sight = self.connection.vehicle.getContextSubscriptionResults(EGO)[EGO]
         self._drives = True
@@ -228,17 +240,56 @@ class SumocfgSimulation(Simulation):
 
     def _look(self) -> None:
         """Take over from SUMO where the ego and the vehicles in its sight are."""
+        if self.connection.vehicletype.getIDCount() > self._known_vtypes:
+            self._look_as_far_as_needed()  # from the next step on
         seen = dict(self.connection.vehicle.getContextSubscriptionResults(EGO))
         ego = seen.pop(EGO)
         self.egos.front_m[0] = self.scene.start_m + ego[constants.VAR_DISTANCE]
         self.egos.speed_mps[0] = ego[constants.VAR_SPEED]
         self.egos.box[0] = _box(ego, self._ego_size_m, self.origin_m)
-        self._follow(seen if seen.keys() <= self.slot.keys() else self._nearest(seen, ego[constants.VAR_POSITION]))
+        seen = self._in_sight(seen, ego[constants.VAR_POSITION3D])
+        self._follow(seen if seen.keys() <= self.slot.keys() else self._nearest(seen, ego[constants.VAR_POSITION3D]))
         self._look_around()
 
-    def _nearest(self, seen: Mapping[str, Sight], front_m: tuple[float, float]) -> dict[str, Sight]:
+    def _look_as_far_as_needed(self) -> None:
+        """Ask SUMO for the vehicles whose front is in sight, or may be beyond it while their back is."""
+        types = self.connection.vehicletype
+        vtypes = types.getIDList()
+        self._known_vtypes = len(vtypes)
+        longest_m = max(map(types.getLength, vtypes))
+        self._any_long = longest_m > LONG_M
+        reach_m = self.scene.sight_m + (longest_m if self._any_long else 0.0)
+        self.connection.vehicle.subscribeContext(EGO, constants.CMD_GET_VEHICLE_VARIABLE, reach_m, _SEEN)
+
+    def _in_sight(self, seen: Mapping[str, Sight], front_m: tuple[float, float, float]) -> dict[str, Sight]:
+        """Return the vehicles that are on the ego's level, not parked beside the road, and in sight."""
+        self._pieces.clear()
+        return {vehicle_id: sight for vehicle_id, sight in seen.items() if self._meets(vehicle_id, sight, front_m)}
+
+    def _meets(self, vehicle_id: str, sight: Sight, front_m: tuple[float, float, float]) -> bool:
+        x_m, y_m, z_m = sight[constants.VAR_POSITION3D]
+        distance_m = math.hypot(x_m - front_m[0], y_m - front_m[1])
+        if sight[constants.VAR_STOPSTATE] & _PARKS or abs(z_m - front_m[2]) > _LEVEL_M + _SLOPE * distance_m:
+            return False
+        if not self._any_long:
+            return True
+        size_m = self._kinds.of(vehicle_id).size_m
+        if size_m[0] > LONG_M:
+            angle_rad = math.radians(sight[constants.VAR_ANGLE])
+            piece = self._bodies.nearest_piece(vehicle_id, size_m, angle_rad, front_m[:2])
+            self._pieces[vehicle_id] = piece
+            distance_m = math.dist(piece[:2], front_m[:2]) - piece[4] / 2
+        return distance_m <= self.scene.sight_m
+
+    def _nearest(self, seen: Mapping[str, Sight], front_m: tuple[float, float, float]) -> dict[str, Sight]:
         """Return as many vehicles as there are slots, nearest first."""
-        nearest = sorted(seen, key=lambda vehicle_id: math.dist(seen[vehicle_id][constants.VAR_POSITION], front_m))
+
+        def distance_m(vehicle_id: str) -> float:
+            piece = self._pieces.get(vehicle_id)
+            x_m, y_m = piece[:2] if piece else seen[vehicle_id][constants.VAR_POSITION3D][:2]
+            return math.hypot(x_m - front_m[0], y_m - front_m[1])
+
+        nearest = sorted(seen, key=distance_m)
         return {vehicle_id: seen[vehicle_id] for vehicle_id in nearest[: self.scene.max_vehicles]}
 
     def _follow(self, near: Mapping[str, Sight]) -> None:
@@ -250,9 +301,13 @@ class SumocfgSimulation(Simulation):
         for vehicle_id, sight in near.items():
             slot = self.slot[vehicle_id] if vehicle_id in self.slot else self._take(vehicle_id)
             if slot != NO_VEHICLE:
-                size_m = slots.length_m.item(0, slot), slots.width_m.item(0, slot)
                 slots.front_m[0, slot] = sight[constants.VAR_DISTANCE]
-                slots.box[0, slot] = _box(sight, size_m, self.origin_m)
+                if vehicle_id in self._pieces:
+                    x_m, y_m, *rest = self._pieces[vehicle_id]
+                    slots.box[0, slot] = (x_m - self.origin_m[0], y_m - self.origin_m[1], *rest)
+                else:
+                    size_m = slots.length_m.item(0, slot), slots.width_m.item(0, slot)
+                    slots.box[0, slot] = _box(sight, size_m, self.origin_m)
 
     def _take(self, vehicle_id: str) -> int:
         """Return the slot that a vehicle takes; ``NO_VEHICLE`` if none is free."""

@@ -1,0 +1,145 @@
+"""Bodies of long vehicles, which bend along the lanes behind their front: trains, trams and articulated buses."""
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from itertools import pairwise
+
+from tint_sumo.simulation.connection import Connection
+
+LONG_M = 15.0  # a longer vehicle bends
+_PIECE_M = 10.0  # longest piece of a body
+_SAME_M = 1e-6
+
+Point = tuple[float, float]
+Box = tuple[float, float, float, float, float, float]  # fields of ``tint_sumo.scenes.geometry.BOX``
+
+
+class Bodies:
+    """Looks up how the long vehicles of a running simulation lie on their lanes."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._behind: dict[tuple[str, str], tuple[str, ...]] = {}  # lanes that lead from an edge to a lane, last first
+
+    def nearest_piece(self, vehicle_id: str, size_m: tuple[float, float], angle_rad: float, point: Point) -> Box:
+        """Return the piece of a vehicle's body that is nearest to a point of the network.
+
+        Args:
+            vehicle_id: id.
+            size_m: length and width of the vehicle.
+            angle_rad: of its heading, clockwise from north, for one that has no lane behind its front.
+            point: x and y.
+        """
+        trace = list(self._trace(vehicle_id, size_m[0]))
+        x_m, y_m = trace[0]
+        if all(math.dist(trace[0], other) < _SAME_M for other in trace):
+            trace.append((x_m - math.sin(angle_rad), y_m - math.cos(angle_rad)))
+        return min(cut(trace, size_m), key=partial(_distance_m, point))
+
+    def _trace(self, vehicle_id: str, length_m: float) -> Iterator[Point]:
+        """Yield points from a vehicle's front along its lanes, at least as far as it is long where lanes are known."""
+        vehicle, lanes = self._connection.vehicle, self._connection.lane
+        front = vehicle.getPosition(vehicle_id)
+        yield front
+        route, index = vehicle.getRoute(vehicle_id), vehicle.getRouteIndex(vehicle_id)
+        lane, left_m = vehicle.getLaneID(vehicle_id), length_m
+        along_m = vehicle.getLanePosition(vehicle_id)
+        while True:
+            shape = lanes.getShape(lane)
+            yield from reversed(_first(shape, along_m * _stretch(shape, lanes.getLength(lane))))
+            left_m -= along_m
+            behind = self._lane_behind(route, index, lane)
+            if left_m <= 0.0 or behind is None:
+                return
+            if not lane.startswith(":"):
+                index -= 1
+            lane = behind
+            along_m = lanes.getLength(lane)
+
+    def _lane_behind(self, route: tuple[str, ...], index: int, lane: str) -> str | None:
+        """Return the lane from which a route leads to a lane; None at the route's beginning.
+
+        Args:
+            route: edges.
+            index: of the edge that the lane is on or, for one on a junction, of the edge before.
+            lane: id.
+        """
+        before = index if lane.startswith(":") else index - 1
+        if before < 0:
+            return None
+        target = (route[before], lane)
+        if target not in self._behind:
+            self._behind[target] = self._find(route[before], lane)
+        found = self._behind[target]
+        return found[0] if found else None
+
+    def _find(self, edge: str, lane: str) -> tuple[str, ...]:
+        """Return the lanes from an edge's lane to another lane, the last of them first; none if they do not meet."""
+        lanes = self._connection.lane
+        for number in range(self._connection.edge.getLaneNumber(edge)):
+            first = f"{edge}_{number}"
+            for link in lanes.getLinks(first):
+                way, after = [first], link[4] or link[0]
+                while after != lane and after.startswith(":"):
+                    way.append(after)
+                    follow = lanes.getLinks(after)[0]
+                    after = follow[4] or follow[0]
+                if after == lane:
+                    return tuple(reversed(way))
+        return ()
+
+
+def _stretch(shape: tuple[Point, ...], length_m: float) -> float:
+    """Return the drawn length of a lane over its length in SUMO."""
+    drawn_m = sum(math.dist(a, b) for a, b in pairwise(shape))
+    return drawn_m / length_m
+
+
+def _first(shape: tuple[Point, ...], length_m: float) -> list[Point]:
+    """Return the points of a line before so much of its length, without the end itself."""
+    points, passed_m = [shape[0]], 0.0
+    for a, b in pairwise(shape):
+        passed_m += math.dist(a, b)
+        if passed_m >= length_m - _SAME_M:
+            break
+        points.append(b)
+    return points
+
+
+def cut(points: list[Point], size_m: tuple[float, float]) -> list[Box]:
+    """Return a body as pieces of equal length.
+
+    Args:
+        points: from its front along its lanes; where they end, the body goes straight on.
+        size_m: length and width.
+    """
+    count = math.ceil(size_m[0] / _PIECE_M)
+    piece_m = size_m[0] / count
+    ends = [_at(points, number * piece_m) for number in range(count + 1)]
+    boxes = []
+    for (ahead_x, ahead_y), (back_x, back_y) in pairwise(ends):
+        chord_m = math.hypot(ahead_x - back_x, ahead_y - back_y)
+        heading = ((ahead_x - back_x) / chord_m, (ahead_y - back_y) / chord_m)
+        boxes.append(((ahead_x + back_x) / 2, (ahead_y + back_y) / 2, *heading, chord_m, size_m[1]))
+    return boxes
+
+
+def _at(points: list[Point], along_m: float) -> Point:
+    """Return the point at a distance along a line, which goes straight on at its end."""
+    distinct = [points[0], *(b for a, b in pairwise(points) if math.dist(a, b) > _SAME_M)]
+    for number, (a, b) in enumerate(pairwise(distinct), 1):
+        length_m = math.dist(a, b)
+        if along_m <= length_m or number == len(distinct) - 1:
+            share = along_m / length_m
+            return (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]))
+        along_m -= length_m
+    return distinct[0]
+
+
+def _distance_m(point: Point, box: Box) -> float:
+    """Return the distance from a point to the middle line of a box."""
+    x_m, y_m, heading_x, heading_y, length_m, _ = box
+    along_m = (point[0] - x_m) * heading_x + (point[1] - y_m) * heading_y
+    along_m = max(-length_m / 2, min(along_m, length_m / 2))
+    return math.hypot(point[0] - x_m - along_m * heading_x, point[1] - y_m - along_m * heading_y)

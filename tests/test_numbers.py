@@ -12,7 +12,7 @@ from tint_sumo import traits
 from tint_sumo.cli import main
 from tint_sumo.config import NO_LEADER_GAP_M, PPO_BUDGETS, SENSORS, STEP_S
 from tint_sumo.core.percentages import percent
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import find_learned, learned_methods
 from tint_sumo.study.results_csv import read_csv
 from tint_sumo.study.summary import Summary, at_mixes, by_title, over_all_mixes
@@ -46,7 +46,7 @@ def test_the_tables_of_the_study_say_what_the_csv_file_says() -> None:
     rows, ceilings = read_csv(RESULTS / "navigation.csv")
     text = re.sub(r" +", " ", (RESULTS / "navigation.md").read_text(encoding="utf-8"))
     for row in at_mixes(rows):
-        rates = [re.escape(percent(row.rate(outcome))) + r" \[[^]]+\]" for outcome in OUTCOMES]
+        rates = [re.escape(percent(row.rate(outcome))) + r" \[[^]]+\]" for outcome in BUILT_IN_OUTCOMES]
         line = " \\| ".join([f"{_mix(row):g}", re.escape(row.title), *rates])
         assert re.search(rf"^\| {line} \|", text, re.MULTILINE), line
     for title, own in by_title(over_all_mixes(rows)).items():
@@ -59,7 +59,7 @@ def test_the_tables_of_the_study_say_what_the_csv_file_says() -> None:
 def test_the_yield_rule_s_page_has_the_study_s_rates() -> None:
     rows, _ = read_csv(RESULTS / "navigation.csv")
     own = {_mix(row): row for row in at_mixes(rows) if row.method == "always_go"}
-    cells = [" / ".join(percent(own[p].rate(outcome)) for outcome in OUTCOMES) for p in (0.25, 0.4, 0.6)]
+    cells = [" / ".join(percent(own[p].rate(outcome)) for outcome in BUILT_IN_OUTCOMES) for p in (0.25, 0.4, 0.6)]
     assert f"| `TIntersection-v1` | {' | '.join(cells)} |" in (DOCS / "explanation" / "yield-rule.md").read_text()
 
 
@@ -203,7 +203,7 @@ def test_the_tables_of_sensors_are_those_of_the_results() -> None:
 
 
 def _outcomes(row: pandas.Series) -> str:
-    return " / ".join(str(row[f"{outcome}_percent"]) for outcome in OUTCOMES)
+    return " / ".join(str(row[f"{outcome}_percent"]) for outcome in BUILT_IN_OUTCOMES)
 
 
 _ONCE = pandas.read_csv(RESULTS / "once.csv")

@@ -97,6 +97,32 @@ def test_a_lost_vehicle_that_nothing_else_hides_is_not_seen_and_a_hidden_one_sta
     assert (lost.tolist(), seen.tolist()) == ([[True, False, False]], [[False, True, False]])
 
 
+def test_white_noise_is_drawn_step_by_step_from_the_second_stream_of_the_episode_s_seed() -> None:
+    with episodes(2, Sensor(noise_m=0.1)) as batch:
+        rngs = [np.random.default_rng(index) for index in (4, 5)]
+        seeds = [int(np.random.default_rng(index).integers(2**63)) for index in (4, 5)]
+        for index, rng in enumerate(rngs):
+            batch.begin(index, rng)
+        drawn = [np.random.default_rng([seed, 1]) for seed in seeds]
+        for _ in range(40):
+            for index, rng in enumerate(drawn):
+                np.testing.assert_array_equal(batch.sensing.noise_m[index], rng.normal(0.0, 0.1, (12, 2)))
+            batch.step(np.array([STOP, CREEP]))
+
+
+def test_a_perfect_sensor_shows_all_vehicles_in_their_slots() -> None:
+    with episodes(2, PERFECT) as batch:
+        for index in range(2):
+            batch.begin(index, np.random.default_rng(index))
+        for _ in range(30):
+            slots, rows = batch.simulation.slots, batch.rows
+            np.testing.assert_array_equal(rows["mask"], slots.present)
+            np.testing.assert_array_equal(rows["track"], slots.vehicle_number)
+            np.testing.assert_array_equal(rows["slot"], np.where(slots.present, np.arange(12), -1))
+            batch.step(np.array([STOP, GO]))
+        assert rows["mask"].sum() > 10 and not batch.sensing.noise_m.any()
+
+
 class Street:
     """Three vehicles ahead of an ego, at 10, 20 and 30 m in the simulation's slots 2, 1 and 0."""
 

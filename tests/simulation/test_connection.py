@@ -46,6 +46,15 @@ def test_half_an_answer_that_an_interrupt_has_left_does_not_keep_traci_from_clos
     simulation.close()
 
 
+def test_a_lock_that_an_interrupt_has_left_does_not_keep_traci_from_closing() -> None:
+    simulation = SceneSimulation(1, T, backend="traci")
+    simulation.link.connection.vehicle._connection._lock.acquire()
+    closing = threading.Thread(target=simulation.close, daemon=True)
+    closing.start()
+    closing.join(20.0)
+    assert not closing.is_alive()
+
+
 @pytest.fixture
 def start_as_user(user_network: Callable[[str], UserNetwork]) -> Iterator[Callable[[], None]]:
     """Start a simulation in libsumo as the user's own program does, and step it once."""

@@ -202,7 +202,10 @@ def _end(connection: Any, process: "subprocess.Popen[bytes]", process_id: int) -
     if process_id == os.getpid():
         process.kill()
         process.wait()
-        with suppress(Exception):  # sumo does not answer any more; an interrupted call may have left half an answer
+        with suppress(Exception):  # an interrupted call may have left anything behind
+            if connection._socket is not None:  # traci would ask sumo to close, and wait for a call that holds its lock
+                connection._socket.close()
+                connection._socket = None
             connection.close(wait=False)
 
 

@@ -48,6 +48,7 @@ from tint_sumo.scenes.geometry import NO_VEHICLE, Floats
 from tint_sumo.simulation import make_simulation
 from tint_sumo.simulation.timing import StepPart, does
 
+PEDESTRIAN = "pedestrian"  # in place of the trait of somebody on foot
 _SEED_LIMIT = 2**63
 _STEP_TOLERANCE = 1e-6  # of decision_s in steps, for numbers such as 0.3 / 0.1
 
@@ -298,9 +299,11 @@ class Episodes:
         return render_scene(self.simulation, index, self.settings.sensor, self.sensing.seen[index])
 
     def collision_info(self, index: int) -> dict[str, Any]:
-        """Return the other driver and the site of a collision; empty if the episode has not ended with a collision."""
+        """Return whom the ego has hit, and where; empty if the episode has not ended with a collision."""
         event = self.simulation.egos.collision[index]
         if event is None or self.rows["outcome"][index] != COLLISION:
             return {}
-        trait = self.simulation.scene.traits[self.simulation.trait_of_member[event.member]]
+        is_person = event.member == NO_VEHICLE
+        of_member = self.simulation.trait_of_member
+        trait = PEDESTRIAN if is_person else self.simulation.scene.traits[of_member[event.member]]
         return {"trait": trait, "route": event.route, "slot": event.slot, "ego_m": (event.ego_x_m, event.ego_y_m)}

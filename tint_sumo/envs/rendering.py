@@ -11,7 +11,7 @@ from PIL import Image, ImageColor, ImageDraw
 from tint_sumo.config import PERFECT, Sensor
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import View
-from tint_sumo.scenes.geometry import Bools, Floats
+from tint_sumo.scenes.geometry import Bools, Boxes, Floats
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.simulation import Simulation
 
@@ -20,6 +20,7 @@ _WIDTH = 736  # pixels
 _OVERSAMPLING = 3  # the image is drawn larger and scaled down, for smooth edges
 _GRASS, _ROAD, _LINE, _EGO, _GLASS = "#e9efe3", "#8f959b", "#ffffff", (240, 180, 0), "#2b2f33"
 
+_PERSON, _PERSON_M = "#7a1f5c", 0.35  # colour and radius
 BUILDING_COLOUR, _SIGHT = "#b9a994", "#1f5fa8"
 _PALENESS = 0.65  # part of the road's colour in that of a vehicle that is not seen
 _FAR_M = 1000.0  # beyond every picture
@@ -55,6 +56,7 @@ def render_scene(
         colour = colours[simulation.trait_of_member[slots.member[replica, slot]]]
         is_seen = seen is None or bool(seen[slot])
         canvas.vehicle(slots.box[replica, slot], colour if is_seen else pale(colour), with_glass=is_seen)
+    canvas.persons(simulation.pedestrians)
     canvas.vehicle(ego, _EGO)
     canvas.sight(sensor, ego)
     return canvas.image()
@@ -117,6 +119,12 @@ class Canvas:
             return
         half_glass_m = 0.8 * half_width_m
         self.draw.polygon(self.part(box, (0.16 * length_m, 0.3 * length_m), (-half_glass_m, half_glass_m)), fill=_GLASS)
+
+    def persons(self, boxes: Boxes) -> None:
+        """Draw persons on foot as discs, a little larger than they are, so that they can be seen."""
+        for across, down in self.pixels(np.stack([boxes["x_m"], boxes["y_m"]], axis=1)):
+            radius = _PERSON_M * self.pixels_per_m
+            self.draw.ellipse((across - radius, down - radius, across + radius, down + radius), fill=_PERSON)
 
     def sight(self, sensor: Sensor, ego: np.void) -> None:
         """Draw the border of an ego's range and field of view, if there are any."""

@@ -86,7 +86,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `reward_terms` | the reward's named terms (after a step)                                                     |
     | `time_s`       | time since the episode's start                                                              |
     | `is_success`   | at the episode's end: whether the outcome is `"success"`                                    |
-    | `collision`    | after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`                 |
+    | `collision`    | after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`; for a person   |
+    |                | on foot in a SUMO configuration, `trait` is `"pedestrian"` and `slot` is -1                 |
 
     ## Arguments
     `gymnasium.make` takes all of these as keyword arguments. The class itself takes `render_mode`, and all others as a

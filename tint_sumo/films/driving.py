@@ -36,6 +36,7 @@ class Moment:
     seen: Bools  # (V,) which of them the ego perceives
     vehicles: Numbers  # (V,) running numbers of the vehicles in the episode, -1 in empty slots
     boxes: Boxes  # (V,)
+    pedestrians: Boxes  # (P,) persons on foot
     brakes: Bools  # (V,)
     traits: Numbers  # (V,) true ones: numbers of profiles, -1 in empty slots
     observed_traits: Floats | None  # (V, Z) traits in the policy's observation; None where it has none
@@ -149,6 +150,7 @@ class _Recorder:
                 seen=self._episodes.sensing.seen[0].copy(),
                 vehicles=slots.vehicle_number[0].copy(),
                 boxes=slots.box[0].copy(),
+                pedestrians=simulation.pedestrians.copy(),
                 brakes=brakes,
                 traits=of_member[slots.member[0]],
                 observed_traits=self._by_vehicle(observation[TRAITS][0]) if TRAITS in observation else None,

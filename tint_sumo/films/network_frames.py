@@ -62,6 +62,7 @@ class NetworkArtist:
         for slot in np.flatnonzero(moment.present).tolist():
             colour, is_seen = self.scene.trait_colours[moment.traits[slot]], bool(moment.seen[slot])
             canvas.vehicle(moment.boxes[slot], colour if is_seen else pale(colour), with_glass=is_seen)
+        canvas.persons(moment.pedestrians)
         canvas.vehicle(moment.ego, EGO_COLOUR)
         canvas.sight(self.sensor, moment.ego)
         return canvas.drawing.reduce(OVERSAMPLING)

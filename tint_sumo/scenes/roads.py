@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 import shapely
+from shapely.ops import substring
 
 from tint_sumo.scenes.geometry import SPACING_M, Floats
 
 _DASH_M, _LINE_M = 1.0, 0.12
+_STRIPE_M = 0.5  # of a crossing, and so wide are the gaps between them
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,17 @@ def paved_areas(net: Any, *, seam_m: float, gap_m: float = 0.0) -> list[shapely.
     ]
     outlines = [node.getShape() for node in net.getNodes() if len(node.getShape()) > 2]
     return [*paved, *(shapely.Polygon(outline).buffer(seam_m) for outline in outlines)]
+
+
+def crossing_marks(net: Any) -> Iterator[shapely.Geometry]:
+    """Yield the stripes of all crossings of a network that sumolib has read with its internal lanes."""
+    for edge in net.getEdges():
+        if edge.getFunction() == "crossing":
+            for lane in edge.getLanes():
+                middle = shapely.LineString(lane.getShape())
+                for start_m in np.arange(_STRIPE_M / 2, middle.length, 2 * _STRIPE_M):
+                    stripe = substring(middle, start_m, start_m + _STRIPE_M)
+                    yield stripe.buffer(lane.getWidth() / 2, cap_style="flat")
 
 
 def border_marks(way: Floats, width_m: float) -> Iterator[shapely.Geometry]:

@@ -29,7 +29,7 @@ from tint_sumo.config import (
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import require_ranges
 from tint_sumo.core.reading import TABLE_BYTES, require_file
-from tint_sumo.scenes.roads import Roads, paved_areas
+from tint_sumo.scenes.roads import Roads, crossing_marks, paved_areas
 from tint_sumo.scenes.scene import EgoTask
 from tint_sumo.scenes.sumo_config import SumoConfig, read_config, read_vtypes
 from tint_sumo.scenes.sumo_run import require_loads
@@ -223,9 +223,10 @@ def _require_sound(lane: Any, file: Path) -> None:
 
 @lru_cache(maxsize=4)
 def network_roads(net_file: Path) -> Roads:
-    """Return the roads of a network; thin lines part their lanes."""
-    net = read_net(net_file, with_internal=False)
-    return Roads(shapely.STRtree(paved_areas(net, seam_m=_SEAM_M, gap_m=_SEAM_M)), shapely.STRtree([]))
+    """Return the roads of a network, with its crossings; thin lines part their lanes."""
+    net = read_net(net_file)
+    paved = paved_areas(net, seam_m=_SEAM_M, gap_m=_SEAM_M)
+    return Roads(shapely.STRtree(paved), shapely.STRtree(list(crossing_marks(net))))
 
 
 def measure_route(net: Any, edges: tuple[str, ...]) -> tuple[tuple[float, ...], list[tuple[float, float]], float]:

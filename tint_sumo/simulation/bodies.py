@@ -1,9 +1,12 @@
 """Bodies of long vehicles, which bend along the lanes behind their front: trains, trams and articulated buses."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from itertools import pairwise
+from typing import Any
+
+from libsumo import constants
 
 from tint_sumo.simulation.connection import Connection
 
@@ -88,6 +91,16 @@ class Bodies:
                 if after == lane:
                     return tuple(reversed(way))
         return ()
+
+
+def box_of(sight: Mapping[int, Any], size_m: tuple[float, float], origin_m: tuple[float, float]) -> Box:
+    """Return the box of a vehicle, or a person, a record; SUMO gives its front, and its angle from north."""
+    x_m, y_m, _ = sight[constants.VAR_POSITION3D]
+    angle_rad = math.radians(sight[constants.VAR_ANGLE])  # clockwise
+    heading_x, heading_y = math.sin(angle_rad), math.cos(angle_rad)
+    half_m = size_m[0] / 2
+    x_m, y_m = x_m - half_m * heading_x - origin_m[0], y_m - half_m * heading_y - origin_m[1]
+    return (x_m, y_m, heading_x, heading_y, *size_m)
 
 
 def _stretch(shape: tuple[Point, ...], length_m: float) -> float:

@@ -31,8 +31,8 @@ _SHORT_STEP_S = 0.1  # in which boxes at both ends are enough
 class Collision:
     """The ego's first collision in an episode."""
 
-    slot: int  # slot of the other vehicle
-    member: int  # number of its driver in the population
+    slot: int  # slot of the other vehicle; NO_VEHICLE for a person on foot
+    member: int  # number of its driver in the population; NO_VEHICLE for a person
     route: str  # name of its route; in a SUMO configuration, the edge that it is on
     ego_x_m: float  # the ego's centre
     ego_y_m: float
@@ -68,13 +68,14 @@ class Egos:
     ``unsafe``      (R,)    result of the safety check for the next step
     ``collision``   R items the first collision in the episode, or None
     ``lost``        (R,)    SUMO has taken the ego off the road, or off its route
+    ``hit_person``  (R,)    it has touched a person on foot in the episode
     =============== ======= ======================================================================
     """
 
     def __init__(self, replicas: int, scene: Scene | SumocfgScene) -> None:
-        self._rules = EgoRules.of(scene)
+        self.rules = EgoRules.of(scene)
         # The safety check needs the distance of a vehicle a step before it is near.
-        near_m = max(self._rules.closing_distance_m, self._rules.unsafe_distance_m)
+        near_m = max(self.rules.closing_distance_m, self.rules.unsafe_distance_m)
         fastest_mps = scene.speed_limit_mps + scene.ego.controller.desired_speeds_mps[-1]
         self._reach_m = near_m + fastest_mps * scene.step_s
         self.front_m: Floats = np.zeros(replicas)
@@ -86,31 +87,32 @@ class Egos:
         self.unsafe: Bools = np.zeros(replicas, bool)
         self._hit_slot: Numbers = np.full(replicas, NO_VEHICLE)
         # In a long step, vehicles can pass through each other unless their boxes are swept from its begin to its end.
-        self._parts = round(scene.step_s / _SHORT_STEP_S)
+        self.parts = round(scene.step_s / _SHORT_STEP_S)
         self._was_box: Boxes = self.box.copy()
         self._were: Boxes = np.zeros((replicas, scene.max_vehicles), BOX)
         self._was_number: Numbers = np.full((replicas, scene.max_vehicles), NO_VEHICLE)
         self.collision: list[Collision | None] = [None] * replicas
         self.lost: Bools = np.zeros(replicas, bool)
+        self.hit_person: Bools = np.zeros(replicas, bool)
 
     @property
     def collided(self) -> Bools:
         """Whether the ego has had a collision in the episode; (R,)."""
-        return np.asarray(self._hit_slot != NO_VEHICLE)
+        return np.asarray((self._hit_slot != NO_VEHICLE) | self.hit_person)
 
     def clear(self, replica: int) -> None:
         """Forget the episode of a replica."""
         self.front_m[replica] = self.speed_mps[replica] = 0.0
         self.box[replica] = self._nowhere[0]
         self.distance_m[replica] = self._was_distance_m[replica] = np.inf
-        self.unsafe[replica] = self.lost[replica] = False
+        self.unsafe[replica] = self.lost[replica] = self.hit_person[replica] = False
         self._hit_slot[replica] = NO_VEHICLE
         self._was_number[replica] = NO_VEHICLE
         self.collision[replica] = None
 
     def drive(self, desired_mps: Floats) -> None:
         """Choose the speeds of a step, and move the fronts on; the boxes follow."""
-        drive(desired_mps, self.unsafe, self._rules, self.speed_mps, self.front_m)
+        drive(desired_mps, self.unsafe, self.rules, self.speed_mps, self.front_m)
 
     @does(StepPart.SAFETY_CHECK)
     def look_around(self, slots: Slots) -> Sequence[tuple[int, int]]:
@@ -118,19 +120,19 @@ class Egos:
         self.distance_m, self._was_distance_m = self._was_distance_m, self.distance_m
         measure_distances_m(self.box, slots.present, slots.box, self._reach_m, self.distance_m)
         any_new = check_safety(
-            self.distance_m, self._was_distance_m, self.box, slots.box, self._rules, self.unsafe, self._hit_slot
+            self.distance_m, self._was_distance_m, self.box, slots.box, self.rules, self.unsafe, self._hit_slot
         )
-        if self._parts > 1:
+        if self.parts > 1:
             any_new |= self._sweep(slots)
         if not any_new:
             return ()
-        collided = np.flatnonzero(self.collided).tolist()
+        collided = np.flatnonzero(self._hit_slot != NO_VEHICLE).tolist()
         return [(replica, int(self._hit_slot[replica])) for replica in collided if self.collision[replica] is None]
 
     def _sweep(self, slots: Slots) -> bool:
         """Look for collisions within the step just made; return whether there is a new one."""
         same = slots.present & (slots.vehicle_number == self._was_number)
-        any_new = sweep(self._was_box, self.box, same, self._were, slots.box, self._parts, self._hit_slot)
+        any_new = sweep(self._was_box, self.box, same, self._were, slots.box, self.parts, self._hit_slot)
         np.copyto(self._was_box, self.box)
         np.copyto(self._were, slots.box)
         np.copyto(self._was_number, slots.vehicle_number)

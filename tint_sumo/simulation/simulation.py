@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from tint_sumo.scenes.geometry import Bools, Floats, Numbers
+from tint_sumo.scenes.geometry import BOX, Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import Building, Scene, View
 from tint_sumo.scenes.sight import walls_of
@@ -57,6 +57,11 @@ class Simulation(ABC):
     @abstractmethod
     def view(self, replica: int) -> View:
         """Return the part of the scene that pictures of a replica show."""
+
+    @property
+    def pedestrians(self) -> Boxes:
+        """The boxes (P,) of persons on foot around the ego; built-in scenes have none."""
+        return np.zeros(0, BOX)
 
     @abstractmethod
     def reset(self, replica: int, seed: int) -> None:

@@ -14,15 +14,17 @@ from libsumo import constants
 
 from tint_sumo.config import NO_LEADER_GAP_M, Backend
 from tint_sumo.core.errors import InputError
-from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Floats, Numbers
+from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import BUILDING, Building, View
 from tint_sumo.scenes.sumo_config import DEFAULT_VTYPE, SumoConfig, base_vtype
 from tint_sumo.scenes.sumo_run import SumocfgRun
 from tint_sumo.scenes.sumocfg import SumocfgScene, network_roads
-from tint_sumo.simulation.bodies import LONG_M, Bodies, Box
+from tint_sumo.simulation.bodies import LONG_M, Bodies, Box, box_of
 from tint_sumo.simulation.connection import Connection, connect
+from tint_sumo.simulation.ego import Collision
 from tint_sumo.simulation.ego_way import EGO, EgoWay, Fate
+from tint_sumo.simulation.persons import Persons
 from tint_sumo.simulation.refusals import Refusals
 from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.simulation.sumo import SPEED_MODE_OBEY_SETSPEED
@@ -86,16 +88,6 @@ class Kinds:
         )
 
 
-def _box(sight: Sight, size_m: tuple[float, float], origin_m: tuple[float, float]) -> tuple[float, ...]:
-    """Return a vehicle's box, a record; SUMO gives its front, and its angle from north."""
-    x_m, y_m, _ = sight[constants.VAR_POSITION3D]
-    angle_rad = math.radians(sight[constants.VAR_ANGLE])  # clockwise
-    heading_x, heading_y = math.sin(angle_rad), math.cos(angle_rad)
-    half_m = size_m[0] / 2
-    x_m, y_m = x_m - half_m * heading_x - origin_m[0], y_m - half_m * heading_y - origin_m[1]
-    return (x_m, y_m, heading_x, heading_y, *size_m)
-
-
 class SumocfgSimulation(Simulation):
     """A single replica of a scene from a SUMO configuration.
 
@@ -127,6 +119,7 @@ class SumocfgSimulation(Simulation):
         self._pieces: dict[str, Box] = {}  # of long vehicles, those nearest to the ego, in the network's frame
         self._known_vtypes = 0
         self._any_long = False
+        self.persons = Persons(scene, self.connection)
         self._drives = False
         self.slot: dict[str, int] = {}
         self._number: dict[str, int] = {}  # number of each vehicle that has been seen
@@ -160,7 +153,7 @@ class SumocfgSimulation(Simulation):
             self._way = EgoWay(self.connection, self.scene.departure[0])
             sight = self.connection.vehicle.getContextSubscriptionResults(EGO)[EGO]
         self._drives = True
-        x_m, y_m, *_ = _box(sight, self._ego_size_m, (0.0, 0.0))
+        x_m, y_m, *_ = box_of(sight, self._ego_size_m, (0.0, 0.0))
         self.origin_m = (x_m, y_m)
         self._build(self._find_buildings())
         self._look()
@@ -179,6 +172,7 @@ class SumocfgSimulation(Simulation):
         self.egos.clear(replica)
         self.slot.clear()
         self._number.clear()
+        self.persons.clear()
         self.origin_m = (0.0, 0.0)
 
     def _define_ego(self) -> None:
@@ -246,10 +240,23 @@ class SumocfgSimulation(Simulation):
         ego = seen.pop(EGO)
         self.egos.front_m[0] = self.scene.start_m + ego[constants.VAR_DISTANCE]
         self.egos.speed_mps[0] = ego[constants.VAR_SPEED]
-        self.egos.box[0] = _box(ego, self._ego_size_m, self.origin_m)
+        self.egos.box[0] = box_of(ego, self._ego_size_m, self.origin_m)
+        self.persons.follow(self.persons.take_from(seen), self.origin_m, ego[constants.VAR_POSITION3D][2])
         seen = self._in_sight(seen, ego[constants.VAR_POSITION3D])
         self._follow(seen if seen.keys() <= self.slot.keys() else self._nearest(seen, ego[constants.VAR_POSITION3D]))
         self._look_around()
+
+    def _look_around(self) -> None:
+        super()._look_around()
+        touched = self.persons.look_around(self.egos) if self.persons.ids else ""
+        if touched and not self.egos.collided[0]:
+            ego, road = self.egos.box[0], str(self.connection.person.getRoadID(touched))
+            self.egos.hit_person[0] = True
+            self.egos.collision[0] = Collision(NO_VEHICLE, NO_VEHICLE, road, float(ego["x_m"]), float(ego["y_m"]))
+
+    @property
+    def pedestrians(self) -> Boxes:
+        return self.persons.boxes
 
     def _look_as_far_as_needed(self) -> None:
         """Ask SUMO for the vehicles whose front is in sight, or may be beyond it while their back is."""
@@ -307,7 +314,7 @@ class SumocfgSimulation(Simulation):
                     slots.box[0, slot] = (x_m - self.origin_m[0], y_m - self.origin_m[1], *rest)
                 else:
                     size_m = slots.length_m.item(0, slot), slots.width_m.item(0, slot)
-                    slots.box[0, slot] = _box(sight, size_m, self.origin_m)
+                    slots.box[0, slot] = box_of(sight, size_m, self.origin_m)
 
     def _take(self, vehicle_id: str) -> int:
         """Return the slot that a vehicle takes; ``NO_VEHICLE`` if none is free."""

@@ -204,7 +204,7 @@ def _limits(found: Check) -> list[str]:
     if found.network.traffic_lights:
         limits.append("traffic lights: others obey them; the ego sees none, and drives through red")
     if found.traffic.persons:
-        limits.append("persons: the ego neither sees them nor collides with them")
+        limits.append("persons: the ego can hit them, and its safety check counts them; they are not observed")
     return limits
 
 

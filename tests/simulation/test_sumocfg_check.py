@@ -2,16 +2,19 @@
 
 import json
 import shlex
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib.image
 import pytest
 
-from tests.scenes.networks import UserNetwork
+from tests.scenes.networks import UserNetwork, write_config
 from tint_sumo.cli import main
 from tint_sumo.scenes import from_sumocfg
+from tint_sumo.scenes.network import sumo_program
 from tint_sumo.simulation.sumocfg_check import Check, check_sumocfg, report
+from tint_sumo.simulation.sumocfg_figure import plot_check
 
 Make = Callable[[str], UserNetwork]
 
@@ -51,9 +54,8 @@ def test_each_suggestion_is_a_scene_and_crosses_its_junction(user_network: Make)
         assert found.routes[0].vehicles > 5
         for route in found.routes:
             scene = from_sumocfg(sumocfg, route.edges, route.start_m, route.goal_m)
-            passed = check_sumocfg(sumocfg, scene).passed
-            assert passed[route.junction] == route.junction_type
             assert 20.0 < scene.goal_m - scene.start_m < 120.0
+        assert check_sumocfg(sumocfg, scene).passed[route.junction] == route.junction_type
 
 
 def test_models_of_cars_and_left_hand_traffic_are_named(user_network: Make, tmp_path: Path) -> None:
@@ -66,6 +68,27 @@ def test_models_of_cars_and_left_hand_traffic_are_named(user_network: Make, tmp_
     for file in (merge, *found.config.demand_files):
         (tmp_path / file.name).write_bytes(file.read_bytes())
     assert "traffic on the left" in report(check_sumocfg(tmp_path / merge.name))
+
+
+def test_persons_and_roads_without_conflicts_are_named(tmp_path: Path) -> None:
+    nodes = "".join(f'<node id="{name}" x="{x}" y="0"/>' for name, x in (("a", 0), ("b", 90), ("c", 180)))
+    (tmp_path / "r.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (tmp_path / "r.edg.xml").write_text(
+        '<edges><edge id="in" from="a" to="b"/><edge id="out" from="b" to="c"/></edges>'
+    )
+    command = [sumo_program("netconvert"), "-n", "r.nod.xml", "-e", "r.edg.xml", "-o", "r.net.xml"]
+    subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
+    (tmp_path / "r.rou.xml").write_text(
+        '<routes><person id="p" depart="3"><walk edges="in out"/></person>'
+        '<trip id="v" depart="5" from="in" to="out"/></routes>'
+    )
+    found = check_sumocfg(write_config(tmp_path / "r.sumocfg", "r.net.xml", "r.rou.xml"))
+    assert (found.traffic.persons, found.traffic.vehicles, found.routes) == (1, {"DEFAULT_VEHTYPE": 1}, ())
+    page = report(found)
+    assert "not supported     persons" in page
+    assert page.endswith("meets others at no junction; any edges that follow each other will do as its route")
+    plot_check(found, tmp_path / "picture.svg")
+    assert (tmp_path / "picture.svg").read_text().startswith("<?xml")
 
 
 def test_the_command_prints_a_page_whose_flags_can_be_copied(

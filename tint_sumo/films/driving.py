@@ -53,7 +53,7 @@ class Driven:
 
     case: Case
     moments: tuple[Moment, ...]
-    origin_m: tuple[float, float]  # position of the scene's origin in the network
+    origin_m: tuple[float, float] = (0.0, 0.0)  # position of the scene's origin in the network
     buildings: tuple[Building, ...] = ()
 
 

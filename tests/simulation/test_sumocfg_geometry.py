@@ -13,7 +13,9 @@ import pytest
 from tests.scenes.networks import write_config
 from tint_sumo.config import Backend, EgoController
 from tint_sumo.envs import SceneEnv, TaskSettings
+from tint_sumo.envs.rendering import render_scene
 from tint_sumo.scenes import SumocfgScene, from_sumocfg
+from tint_sumo.scenes.geometry import clearance_m
 from tint_sumo.scenes.network import sumo_program
 from tint_sumo.simulation import SumocfgSimulation
 from tint_sumo.simulation.bodies import Bodies, cut
@@ -133,6 +135,38 @@ def test_vehicles_on_a_bridge_are_neither_hit_nor_waited_for(make: Make) -> None
         assert not near_m
         assert not simulation.egos.collided[0]
         assert simulation.egos.front_m[0] > 250.0
+
+
+def test_a_long_vehicle_on_a_bridge_is_as_high_where_it_is_nearest(make: Make) -> None:
+    demand = """<vType id="long" length="120"/><vehicle id="b" type="long" depart="0" departPos="180">
+        <route edges="bridge"/><stop lane="bridge_0" endPos="185" duration="999"/></vehicle>"""
+    with begun(make(demand)) as simulation:
+        for _ in drive(simulation, 10.0, 600):
+            assert not simulation.egos.unsafe[0]
+        assert simulation.egos.front_m[0] > 250.0
+
+
+def test_only_vtypes_that_vehicles_have_widen_the_look(make: Make) -> None:
+    car = '<vehicle id="c" depart="0" departPos="70"><route edges="wm me"/></vehicle>'
+    with begun(make(car, warm_up_s=1.0)) as simulation:
+        assert not simulation._any_long
+    with begun(make(TRAIN.format(0))) as simulation:
+        assert simulation._any_long
+
+
+def test_pictures_show_the_whole_body(make: Make) -> None:
+    with begun(make(TRAIN.format(250), start_m=85.0)) as simulation:
+        for _ in drive(simulation, 0.0, 30):
+            pass
+        (slot,) = simulation.slot.values()
+        pieces = simulation.bodies[slot]
+        assert len(pieces) == 15
+        ego = simulation.egos.box[0]
+        nearest = min(pieces, key=lambda piece: clearance_m(ego, piece))
+        assert nearest == simulation.slots.box[0, slot]
+        image = render_scene(simulation, 0)
+        colour = simulation.scene.trait_colours[simulation.slots.member[0, slot]]
+        assert (image == colour).all(axis=-1).sum() > 2.5 * 36.0 * 12.0**2  # 12 pixels per metre, 40 m up and down
 
 
 def test_a_train_is_seen_and_waited_for_until_its_end_has_passed(make: Make) -> None:

@@ -112,6 +112,7 @@ def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -
         desired_mps=3.0,
         value=-1.25,
         outcome=outcome,
+        bodies={},
         pedestrians=new_boxes(0, 0.0, 0.0),
     )
     return replace(common, **changes)

@@ -55,7 +55,9 @@ def render_scene(
     for slot in np.flatnonzero(slots.present[replica]).tolist():
         colour = colours[simulation.trait_of_member[slots.member[replica, slot]]]
         is_seen = seen is None or bool(seen[slot])
-        canvas.vehicle(slots.box[replica, slot], colour if is_seen else pale(colour), with_glass=is_seen)
+        shown = colour if is_seen else pale(colour)
+        canvas.body(simulation.bodies.get(slot), shown)
+        canvas.vehicle(slots.box[replica, slot], shown, with_glass=is_seen and slot not in simulation.bodies)
     canvas.persons(simulation.pedestrians)
     canvas.vehicle(ego, _EGO)
     canvas.sight(sensor, ego)
@@ -119,6 +121,11 @@ class Canvas:
             return
         half_glass_m = 0.8 * half_width_m
         self.draw.polygon(self.part(box, (0.16 * length_m, 0.3 * length_m), (-half_glass_m, half_glass_m)), fill=_GLASS)
+
+    def body(self, pieces: Boxes | None, colour: tuple[int, ...]) -> None:
+        """Draw the pieces of a vehicle that bends, if it does."""
+        for piece in () if pieces is None else pieces:
+            self.vehicle(piece, colour, with_glass=False)
 
     def persons(self, boxes: Boxes) -> None:
         """Draw persons on foot as discs, a little larger than they are, so that they can be seen."""

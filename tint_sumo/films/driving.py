@@ -1,5 +1,6 @@
 """Drive one case step by step, and keep all that a film shows."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +37,7 @@ class Moment:
     seen: Bools  # (V,) which of them the ego perceives
     vehicles: Numbers  # (V,) running numbers of the vehicles in the episode, -1 in empty slots
     boxes: Boxes  # (V,)
+    bodies: Mapping[int, Boxes]  # pieces (P,) of vehicles that bend, by their slots
     pedestrians: Boxes  # (P,) persons on foot
     brakes: Bools  # (V,)
     traits: Numbers  # (V,) true ones: numbers of profiles, -1 in empty slots
@@ -150,6 +152,7 @@ class _Recorder:
                 seen=self._episodes.sensing.seen[0].copy(),
                 vehicles=slots.vehicle_number[0].copy(),
                 boxes=slots.box[0].copy(),
+                bodies=simulation.bodies,
                 pedestrians=simulation.pedestrians.copy(),
                 brakes=brakes,
                 traits=of_member[slots.member[0]],

@@ -61,7 +61,9 @@ class NetworkArtist:
             canvas.fill(shapely.Polygon(building), BUILDING_COLOUR)
         for slot in np.flatnonzero(moment.present).tolist():
             colour, is_seen = self.scene.trait_colours[moment.traits[slot]], bool(moment.seen[slot])
-            canvas.vehicle(moment.boxes[slot], colour if is_seen else pale(colour), with_glass=is_seen)
+            shown = colour if is_seen else pale(colour)
+            canvas.body(moment.bodies.get(slot), shown)
+            canvas.vehicle(moment.boxes[slot], shown, with_glass=is_seen and slot not in moment.bodies)
         canvas.persons(moment.pedestrians)
         canvas.vehicle(moment.ego, EGO_COLOUR)
         canvas.sight(self.sensor, moment.ego)

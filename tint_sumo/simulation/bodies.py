@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from functools import partial
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
+import numpy as np
 from libsumo import constants
 
+from tint_sumo.scenes.geometry import BOX, Boxes, measure_distances_m
 from tint_sumo.simulation.connection import Connection
 
 LONG_M = 15.0  # a longer vehicle bends
@@ -18,6 +20,31 @@ Point = tuple[float, float]
 Box = tuple[float, float, float, float, float, float]  # fields of ``tint_sumo.scenes.geometry.BOX``
 
 
+@dataclass(frozen=True)
+class Body:
+    """A long vehicle in the scene's frame."""
+
+    boxes: Boxes  # (P,) its pieces, the front first
+    nearest: int  # number of the piece that is nearest to the ego
+    distance_m: float  # of its box to the ego's
+
+    @classmethod
+    def of(cls, pieces: list[Box], origin_m: Point, ego: Boxes) -> Self:
+        """Return a body of pieces in the network's frame; (1,) box of the ego in the scene's."""
+        boxes = np.array(pieces, BOX)
+        boxes["x_m"] -= origin_m[0]
+        boxes["y_m"] -= origin_m[1]
+        distances_m = np.full((1, len(boxes)), np.inf)
+        measure_distances_m(ego, np.ones(distances_m.shape, bool), boxes[None], np.inf, distances_m)
+        nearest = int(distances_m[0].argmin())
+        return cls(boxes, nearest, float(distances_m[0, nearest]))
+
+    @property
+    def nearest_box(self) -> np.void:
+        box: np.void = self.boxes[self.nearest]
+        return box
+
+
 class Bodies:
     """Looks up how the long vehicles of a running simulation lie on their lanes."""
 
@@ -25,40 +52,56 @@ class Bodies:
         self._connection = connection
         self._behind: dict[tuple[str, str], tuple[str, ...]] = {}  # lanes that lead from an edge to a lane, last first
 
-    def nearest_piece(self, vehicle_id: str, size_m: tuple[float, float], angle_rad: float, point: Point) -> Box:
-        """Return the piece of a vehicle's body that is nearest to a point of the network.
+    def pieces(self, vehicle_id: str, size_m: tuple[float, float], angle_rad: float) -> list[Box]:
+        """Return the pieces of a vehicle's body, the front first, in the network's frame.
 
         Args:
             vehicle_id: id.
             size_m: length and width of the vehicle.
             angle_rad: of its heading, clockwise from north, for one that has no lane behind its front.
-            point: x and y.
         """
         trace = list(self._trace(vehicle_id, size_m[0]))
         x_m, y_m = trace[0]
         if all(math.dist(trace[0], other) < _SAME_M for other in trace):
             trace.append((x_m - math.sin(angle_rad), y_m - math.cos(angle_rad)))
-        return min(cut(trace, size_m), key=partial(_distance_m, point))
+        return cut(trace, size_m)
+
+    def height_m(self, vehicle_id: str, back_m: float) -> float:
+        """Return z of the lane under a vehicle, so far behind its front, or of the last lane that is known."""
+        found, position_m = "", 0.0
+        for lane, along_m in self._lanes_under(vehicle_id):
+            found, position_m = lane, along_m - back_m
+            if position_m >= 0.0:
+                break
+            back_m -= along_m
+        edge, _, number = found.rpartition("_")
+        _, _, z_m = self._connection.simulation.convert3D(edge, max(position_m, 0.0), int(number))
+        return float(z_m)
 
     def _trace(self, vehicle_id: str, length_m: float) -> Iterator[Point]:
         """Yield points from a vehicle's front along its lanes, at least as far as it is long where lanes are known."""
-        vehicle, lanes = self._connection.vehicle, self._connection.lane
-        front = vehicle.getPosition(vehicle_id)
-        yield front
-        route, index = vehicle.getRoute(vehicle_id), vehicle.getRouteIndex(vehicle_id)
-        lane, left_m = vehicle.getLaneID(vehicle_id), length_m
-        along_m = vehicle.getLanePosition(vehicle_id)
-        while True:
+        lanes = self._connection.lane
+        yield self._connection.vehicle.getPosition(vehicle_id)
+        for lane, along_m in self._lanes_under(vehicle_id):
             shape = lanes.getShape(lane)
             yield from reversed(_first(shape, along_m * _stretch(shape, lanes.getLength(lane))))
-            left_m -= along_m
-            behind = self._lane_behind(route, index, lane)
-            if left_m <= 0.0 or behind is None:
+            length_m -= along_m
+            if length_m <= 0.0:
                 return
+
+    def _lanes_under(self, vehicle_id: str) -> Iterator[tuple[str, float]]:
+        """Yield the lanes that a vehicle has come along, its present one first, each with how far it has come on it."""
+        vehicle = self._connection.vehicle
+        route, index = vehicle.getRoute(vehicle_id), vehicle.getRouteIndex(vehicle_id)
+        lane: str | None = vehicle.getLaneID(vehicle_id)
+        along_m = vehicle.getLanePosition(vehicle_id)
+        while lane:
+            yield lane, along_m
+            behind = self._lane_behind(route, index, lane)
             if not lane.startswith(":"):
                 index -= 1
             lane = behind
-            along_m = lanes.getLength(lane)
+            along_m = self._connection.lane.getLength(lane) if lane else 0.0
 
     def _lane_behind(self, route: tuple[str, ...], index: int, lane: str) -> str | None:
         """Return the lane from which a route leads to a lane; None at the route's beginning.
@@ -148,11 +191,3 @@ def _at(points: list[Point], along_m: float) -> Point:
             return (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]))
         along_m -= length_m
     return distinct[0]
-
-
-def _distance_m(point: Point, box: Box) -> float:
-    """Return the distance from a point to the middle line of a box."""
-    x_m, y_m, heading_x, heading_y, length_m, _ = box
-    along_m = (point[0] - x_m) * heading_x + (point[1] - y_m) * heading_y
-    along_m = max(-length_m / 2, min(along_m, length_m / 2))
-    return math.hypot(point[0] - x_m - along_m * heading_x, point[1] - y_m - along_m * heading_y)

@@ -1,7 +1,7 @@
 """The interface of all simulations, and the parts that they share."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -57,6 +57,11 @@ class Simulation(ABC):
     @abstractmethod
     def view(self, replica: int) -> View:
         """Return the part of the scene that pictures of a replica show."""
+
+    @property
+    def bodies(self) -> Mapping[int, Boxes]:
+        """The pieces (P,) of vehicles that bend, by their slots, whose box is the nearest of them; for pictures."""
+        return {}
 
     @property
     def pedestrians(self) -> Boxes:

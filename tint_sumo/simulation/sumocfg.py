@@ -20,7 +20,7 @@ from tint_sumo.scenes.scene import BUILDING, Building, View
 from tint_sumo.scenes.sumo_config import DEFAULT_VTYPE, SumoConfig, base_vtype
 from tint_sumo.scenes.sumo_run import SumocfgRun
 from tint_sumo.scenes.sumocfg import SumocfgScene, network_roads
-from tint_sumo.simulation.bodies import LONG_M, Bodies, Box, box_of
+from tint_sumo.simulation.bodies import LONG_M, Bodies, Body, box_of
 from tint_sumo.simulation.connection import Connection, connect
 from tint_sumo.simulation.ego import Collision
 from tint_sumo.simulation.ego_way import EGO, EgoWay, Fate
@@ -116,7 +116,7 @@ class SumocfgSimulation(Simulation):
         self.warm_starts = WarmStarts(scene, self.connection, self._run)
         self._kinds = Kinds(scene.config, scene.vtypes, self.connection)
         self._bodies = Bodies(self.connection)
-        self._pieces: dict[str, Box] = {}  # of long vehicles, those nearest to the ego, in the network's frame
+        self._long: dict[str, Body] = {}  # those around the ego
         self._known_vtypes = 0
         self._any_long = False
         self.persons = Persons(scene, self.connection)
@@ -173,6 +173,7 @@ class SumocfgSimulation(Simulation):
         self.slot.clear()
         self._number.clear()
         self.persons.clear()
+        self._long.clear()
         self.origin_m = (0.0, 0.0)
 
     def _define_ego(self) -> None:
@@ -258,43 +259,52 @@ class SumocfgSimulation(Simulation):
     def pedestrians(self) -> Boxes:
         return self.persons.boxes
 
+    @property
+    def bodies(self) -> dict[int, Boxes]:
+        return {self.slot[vehicle_id]: body.boxes for vehicle_id, body in self._long.items() if vehicle_id in self.slot}
+
     def _look_as_far_as_needed(self) -> None:
         """Ask SUMO for the vehicles whose front is in sight, or may be beyond it while their back is."""
         types = self.connection.vehicletype
         vtypes = types.getIDList()
         self._known_vtypes = len(vtypes)
-        longest_m = max(map(types.getLength, vtypes))
+        # SUMO always has types that no vehicle needs to have, such as one of trains.
+        labels = self.scene.vtypes
+        lengths_m = (types.getLength(vtype) for vtype in vtypes if base_vtype(vtype, labels) in labels)
+        longest_m = max(lengths_m, default=0.0)
         self._any_long = longest_m > LONG_M
         reach_m = self.scene.sight_m + (longest_m if self._any_long else 0.0)
         self.connection.vehicle.subscribeContext(EGO, constants.CMD_GET_VEHICLE_VARIABLE, reach_m, _SEEN)
 
     def _in_sight(self, seen: Mapping[str, Sight], front_m: tuple[float, float, float]) -> dict[str, Sight]:
         """Return the vehicles that are on the ego's level, not parked beside the road, and in sight."""
-        self._pieces.clear()
+        self._long.clear()
         return {vehicle_id: sight for vehicle_id, sight in seen.items() if self._meets(vehicle_id, sight, front_m)}
 
     def _meets(self, vehicle_id: str, sight: Sight, front_m: tuple[float, float, float]) -> bool:
         x_m, y_m, z_m = sight[constants.VAR_POSITION3D]
         distance_m = math.hypot(x_m - front_m[0], y_m - front_m[1])
-        if sight[constants.VAR_STOPSTATE] & _PARKS or abs(z_m - front_m[2]) > _LEVEL_M + _SLOPE * distance_m:
+        if sight[constants.VAR_STOPSTATE] & _PARKS:
             return False
-        if not self._any_long:
-            return True
-        size_m = self._kinds.of(vehicle_id).size_m
-        if size_m[0] > LONG_M:
-            angle_rad = math.radians(sight[constants.VAR_ANGLE])
-            piece = self._bodies.nearest_piece(vehicle_id, size_m, angle_rad, front_m[:2])
-            self._pieces[vehicle_id] = piece
-            distance_m = math.dist(piece[:2], front_m[:2]) - piece[4] / 2
-        return distance_m <= self.scene.sight_m
+        if self._any_long:
+            size_m = self._kinds.of(vehicle_id).size_m
+            if size_m[0] > LONG_M:
+                pieces = self._bodies.pieces(vehicle_id, size_m, math.radians(sight[constants.VAR_ANGLE]))
+                body = Body.of(pieces, self.origin_m, self.egos.box)
+                z_m = self._bodies.height_m(vehicle_id, size_m[0] * (body.nearest + 0.5) / len(pieces))
+                distance_m = body.distance_m
+                self._long[vehicle_id] = body
+            if distance_m > self.scene.sight_m:
+                return False
+        return bool(abs(z_m - front_m[2]) <= _LEVEL_M + _SLOPE * distance_m)
 
     def _nearest(self, seen: Mapping[str, Sight], front_m: tuple[float, float, float]) -> dict[str, Sight]:
         """Return as many vehicles as there are slots, nearest first."""
 
         def distance_m(vehicle_id: str) -> float:
-            piece = self._pieces.get(vehicle_id)
-            x_m, y_m = piece[:2] if piece else seen[vehicle_id][constants.VAR_POSITION3D][:2]
-            return math.hypot(x_m - front_m[0], y_m - front_m[1])
+            if vehicle_id in self._long:
+                return self._long[vehicle_id].distance_m
+            return math.dist(seen[vehicle_id][constants.VAR_POSITION3D][:2], front_m[:2])
 
         nearest = sorted(seen, key=distance_m)
         return {vehicle_id: seen[vehicle_id] for vehicle_id in nearest[: self.scene.max_vehicles]}
@@ -309,9 +319,8 @@ class SumocfgSimulation(Simulation):
             slot = self.slot[vehicle_id] if vehicle_id in self.slot else self._take(vehicle_id)
             if slot != NO_VEHICLE:
                 slots.front_m[0, slot] = sight[constants.VAR_DISTANCE]
-                if vehicle_id in self._pieces:
-                    x_m, y_m, *rest = self._pieces[vehicle_id]
-                    slots.box[0, slot] = (x_m - self.origin_m[0], y_m - self.origin_m[1], *rest)
+                if vehicle_id in self._long:
+                    slots.box[0, slot] = self._long[vehicle_id].nearest_box
                 else:
                     size_m = slots.length_m.item(0, slot), slots.width_m.item(0, slot)
                     slots.box[0, slot] = box_of(sight, size_m, self.origin_m)

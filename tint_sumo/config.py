@@ -60,6 +60,8 @@ Layer = Annotated[int, Range(1, 2048)]
 Layers = Annotated[Many[Layer], Length(0, 8)]
 SomeLayers = Annotated[Many[Layer], Length(1, 8)]
 Decisions = Annotated[int, Range(1, 10**12)]
+SignedM = Annotated[float, Range(-1000.0, 1000.0)]
+TimeShiftS = Annotated[float, Range(0.0, 20.0)]
 DriverSpeedMps = Annotated[float, Range(0.01, 60.0)]  # SUMO writes 0 for less than 0.01
 ArrivalsPerS = Annotated[float, Range(1e-6, 100.0)]
 
@@ -131,6 +133,67 @@ class Idm:
 
 
 @dataclass(frozen=True)
+class Towns:
+    """Towns that drivers are drawn from: each episode is in one of them.
+
+    The drivers of a town are alike in the mean, and towns differ in it: each draws its levels uniformly from ``tau_s``,
+    ``desired_speed_mps``, ``accel_mps2``, ``decel_mps2``, ``min_gap_factor`` and ``entry_gap_m``. Its profiles differ
+    from these levels by shifts that it draws, too: drivers who yield keep longer headways and gaps than those who do
+    not, and are slower. So a driver is conservative relative to its neighbours. In a town, each of the three shifts is
+    nothing with the probability ``alike``, independently of the others.
+    """
+
+    count: Annotated[int, Range(1, MOST_VTYPES)] = 128
+    seed: TrafficSeed = 2022  # seed of the draws; another one gives other towns
+    only: Annotated[int, Range(0, MOST_VTYPES - 1)] | None = None  # all episodes are in the town of this number, from 0
+    tau_s: tuple[TauS, TauS] = (0.6, 1.8)
+    desired_speed_mps: tuple[DriverSpeedMps, DriverSpeedMps] = (2.3, 3.1)
+    accel_mps2: tuple[AccelMps2, AccelMps2] = (2.0, 4.0)
+    decel_mps2: tuple[AccelMps2, AccelMps2] = (1.5, 2.5)  # comfortable braking
+    min_gap_factor: tuple[Gain, Gain] = (0.7, 2.0)  # times the minimum gaps of the profiles
+    entry_gap_m: tuple[SignedM, SignedM] = (-1.0, 1.5)  # added to the entry gaps of the profiles
+    tau_shift_s: tuple[TimeShiftS, TimeShiftS] = (0.0, 0.5)  # headway of those who yield less that of the others
+    speed_shift_mps: tuple[SpeedMps, SpeedMps] = (0.0, 0.7)  # speed of those who do not yield less that of the others
+    gap_share: tuple[Fraction, Fraction] = (0.0, 1.0)  # share that is left of the profiles' difference in gaps
+    alike: Fraction = 0.5
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+        for name in (*TOWN_LEVELS, *TOWN_SHIFTS):
+            low, high = getattr(self, name)
+            if low > high:
+                raise InputError(f"{name} must be two numbers from low to high, not {low:g} and {high:g}")
+        if self.only is not None and self.only >= self.count:
+            raise InputError(f"only must be the number of a town, 0 to {self.count - 1}, not {self.only}")
+        if self.least_tau_s <= 0.0:
+            raise InputError(f"tau_s must exceed half of tau_shift_s, {self.tau_shift_s[1] / 2:g} s, in every town")
+        if self.desired_speed_mps[0] <= self.speed_shift_mps[1] / 2:
+            raise InputError(
+                f"desired_speed_mps must exceed half of speed_shift_mps, {self.speed_shift_mps[1] / 2:g} m/s, "
+                "in every town"
+            )
+
+    @property
+    def least_tau_s(self) -> float:
+        """Shortest headway that a driver can have."""
+        return self.tau_s[0] - self.tau_shift_s[1] / 2
+
+    @property
+    def top_speed_mps(self) -> float:
+        """Highest desired speed that a driver can have."""
+        return self.desired_speed_mps[1] + self.speed_shift_mps[1] / 2
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of the towns that episodes are in."""
+        return range(self.count) if self.only is None else range(self.only, self.only + 1)
+
+
+TOWN_LEVELS = ("tau_s", "desired_speed_mps", "accel_mps2", "decel_mps2", "min_gap_factor", "entry_gap_m")
+TOWN_SHIFTS = ("tau_shift_s", "speed_shift_mps", "gap_share")
+
+
+@dataclass(frozen=True)
 class Population:
     """The vTypes drivers are drawn from."""
 
@@ -138,6 +201,8 @@ class Population:
     members: Annotated[int, Range(1, MOST_VTYPES)] = 32  # vTypes of a profile of weight 1, each with its own draws
     seed: TrafficSeed = 2022  # seed of the draws
     idm: Idm = Idm()
+    towns: Towns | None = None  # the members are those of each town then
+    car_following: Literal["IDM", "EIDM", "Krauss", "ACC", "CACC"] = "IDM"  # SUMO's model, with the values of ``idm``
 
     def __post_init__(self) -> None:
         names = [profile.name for profile in self.profiles]
@@ -146,12 +211,39 @@ class Population:
         if len(set(names)) < len(names):
             raise InputError(f"profiles must have names of their own, not {', '.join(names)}")
         require_ranges(self)
-        vtypes = sum(max(1, round(self.members * profile.weight)) for profile in self.profiles)
+        if self.towns is not None and self.towns.decel_mps2[1] > self.idm.emergency_decel_mps2:
+            raise InputError(
+                f"decel_mps2 of towns must not exceed emergency_decel_mps2 ({self.idm.emergency_decel_mps2:g}), "
+                f"{self.towns.decel_mps2[1]:g} does"
+            )
+        towns = 1 if self.towns is None else len(self.towns.numbers)
+        vtypes = towns * sum(max(1, round(self.members * profile.weight)) for profile in self.profiles)
         if vtypes > MOST_VTYPES:
-            raise InputError(f"members times the weights of profiles must be {MOST_VTYPES:,} at most, not {vtypes:,}")
+            times = "members times the weights of profiles" + ("" if self.towns is None else " times towns")
+            raise InputError(f"{times} must be {MOST_VTYPES:,} at most, not {vtypes:,}")
+
+    @property
+    def least_tau_s(self) -> float:
+        """Shortest time headway that a driver can have."""
+        return self.idm.tau_s if self.towns is None else self.towns.least_tau_s
+
+    def with_tau(self, tau_s: float) -> "Population":
+        """Return the population with this time headway for everybody, in every town."""
+        towns = self.towns and replace(self.towns, tau_s=(tau_s, tau_s), tau_shift_s=(0.0, 0.0))
+        return replace(self, idm=replace(self.idm, tau_s=tau_s), towns=towns)
 
 
-POPULATIONS = {"traits": Population(), "continuous": Population((CONTINUOUS,), members=512)}
+_TOWNS = Population(members=8, towns=Towns())
+POPULATIONS = {
+    "traits": Population(),
+    "continuous": Population((CONTINUOUS,), members=512),
+    "same_speed": Population(tuple(replace(profile, desired_speed_mps=(2.7, 2.7)) for profile in DRIVER_PROFILES)),
+    "same_gap": Population(
+        tuple(replace(profile, min_gap_m=(0.3, 0.7), entry_gap_m=(3.0, 6.0)) for profile in DRIVER_PROFILES)
+    ),
+    "towns": _TOWNS,
+    "held_out_towns": replace(_TOWNS, towns=Towns(count=64, seed=2023)),
+}
 
 
 @dataclass(frozen=True, order=True, init=False)

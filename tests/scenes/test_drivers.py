@@ -1,15 +1,26 @@
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, POPULATIONS, Population, VehicleShape
+from tint_sumo.config import (
+    AGGRESSIVE,
+    CONSERVATIVE,
+    POPULATIONS,
+    TOWN_LEVELS,
+    TOWN_SHIFTS,
+    Population,
+    Towns,
+    VehicleShape,
+)
+from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import T_INTERSECTION, find_scene
-from tint_sumo.scenes.drivers import members, vtypes_xml
+from tint_sumo.scenes.drivers import draw_town, members, vtypes_xml
 from tint_sumo.scenes.layout import layout
-from tint_sumo.simulation.demand import DriverPool, DriverStream
+from tint_sumo.simulation.demand import Demand, DriverPool, DriverStream
 
 
 def test_members_follow_the_papers_traits() -> None:
@@ -69,3 +80,100 @@ def test_profiles_are_drawn_by_their_weights_in_plain_sumo_and_in_the_environmen
     drawn = Counter(names[stream.take().member] for _ in range(4000))
     for name, share in shares.items():
         assert drawn[name] / 4000 == pytest.approx(share, abs=0.03)
+
+
+TOWNS = Towns(count=400)
+MANY = replace(POPULATIONS["towns"], members=1, towns=TOWNS)
+
+
+def test_towns_follow_from_their_seed_and_number_alone() -> None:
+    few = members(replace(MANY, towns=replace(TOWNS, count=3)))
+    assert few == members(MANY)[: len(few)]
+    assert members(replace(MANY, towns=replace(TOWNS, only=2))) == few[4:6]
+    assert all(draw_town(TOWNS, town) != draw_town(replace(TOWNS, seed=1), town) for town in range(3))
+
+
+def test_levels_of_towns_fill_their_ranges_and_each_shift_is_nothing_in_half_of_them() -> None:
+    towns = [draw_town(TOWNS, number) for number in TOWNS.numbers]
+    for name in (*TOWN_LEVELS, *TOWN_SHIFTS):
+        low, high = getattr(TOWNS, name)
+        drawn = np.array([getattr(town, name) for town in towns])
+        drawn = drawn[drawn != 0.0] if name in TOWN_SHIFTS else drawn
+        assert low <= drawn.min() < low + 0.05 * (high - low) and high - 0.05 * (high - low) < drawn.max() <= high
+    none = np.array([[getattr(town, name) == 0.0 for name in TOWN_SHIFTS] for town in towns])
+    assert none.mean(axis=0) == pytest.approx(0.5, abs=0.07)
+    assert none.all(axis=1).mean() == pytest.approx(0.125, abs=0.04)
+
+
+def test_drivers_differ_from_their_town_by_its_shifts() -> None:
+    drivers = members(MANY)
+    for number, (yielding, hasty) in enumerate(zip(drivers[::2], drivers[1::2], strict=True)):
+        town = draw_town(TOWNS, number)
+        assert yielding.town == hasty.town == number
+        assert (yielding.profile, hasty.profile) == (CONSERVATIVE, AGGRESSIVE)
+        assert yielding.idm.tau_s - hasty.idm.tau_s == pytest.approx(town.tau_shift_s, abs=2e-4)
+        assert (yielding.idm.tau_s + hasty.idm.tau_s) / 2 == pytest.approx(town.tau_s, abs=2e-4)
+        assert hasty.desired_speed_mps - yielding.desired_speed_mps == pytest.approx(town.speed_shift_mps, abs=2e-4)
+        assert yielding.idm.accel_mps2 == hasty.idm.accel_mps2 == town.accel_mps2
+        entry = np.subtract(yielding.entry_gap_m, hasty.entry_gap_m)
+        assert entry == pytest.approx([town.gap_share] * 2)  # the profiles differ by 1 m
+        assert np.mean([*yielding.entry_gap_m, *hasty.entry_gap_m]) == pytest.approx(4.5 + town.entry_gap_m)
+        for driver, gap_m in ((yielding, 0.5 + 0.1 * town.gap_share), (hasty, 0.5 - 0.1 * town.gap_share)):
+            assert abs(driver.min_gap_m / town.min_gap_factor - gap_m) <= 0.1 + 1e-3
+
+
+def test_an_episode_draws_from_the_drivers_of_one_town_whatever_the_batch() -> None:
+    scene = replace(find_scene(T_INTERSECTION), population=replace(MANY, towns=replace(TOWNS, count=20)))
+    drivers, towns = members(scene.population), []
+    for seed in range(40):
+        placed = [
+            Demand(replicas, drivers, layout(scene)).begin(replicas - 1, np.random.SeedSequence(seed))
+            for replicas in (1, 3)
+        ]
+        assert placed[0] == placed[1]
+        (town,) = {drivers[vehicle.member].town for vehicle in placed[0]}
+        towns.append(town)
+    assert len(set(towns)) > 10
+
+
+def test_there_is_a_distribution_for_each_town_and_plain_sumo_drives_the_first_one() -> None:
+    for only, numbers in ((None, (0, 1, 2)), (2, (2,))):
+        xml = vtypes_xml(replace(MANY, towns=replace(TOWNS, count=3, only=only)), 0.4, VehicleShape())
+        found = {entry.attrib["id"]: entry.attrib for entry in ElementTree.fromstring(xml).iter("vTypeDistribution")}
+        assert list(found) == ["drivers", *(f"drivers.{number}" for number in numbers)]
+        for number in numbers:
+            named = found[f"drivers.{number}"]
+            assert named["vTypes"] == f"conservative.{number}.0 aggressive.{number}.0"
+            assert named["probabilities"] == "0.4 0.6"
+        assert found["drivers"]["vTypes"] == found[f"drivers.{numbers[0]}"]["vTypes"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"tau_s": (1.8, 0.6)}, "tau_s must be two numbers from low to high, not 1.8 and 0.6"),
+        ({"only": 128}, "only must be the number of a town, 0 to 127, not 128"),
+        ({"tau_s": (0.2, 1.0)}, "tau_s must exceed half of tau_shift_s, 0.25 s, in every town"),
+        ({"desired_speed_mps": (0.3, 1.0)}, "desired_speed_mps must exceed half of speed_shift_mps, 0.35 m/s"),
+        ({"count": 0}, "count must lie in 1 to 10,000, not 0"),
+    ],
+)
+def test_towns_that_cannot_be_are_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Towns(**wrong)
+
+
+def test_populations_of_towns_that_cannot_be_are_refused() -> None:
+    with pytest.raises(InputError, match="times towns must be 10,000 at most, not 16,000"):
+        Population(members=8, towns=Towns(count=1000))
+    with pytest.raises(InputError, match=r"decel_mps2 of towns must not exceed emergency_decel_mps2 \(9\), 10 does"):
+        Population(towns=Towns(count=2, decel_mps2=(1.0, 10.0)))
+    scene = find_scene(T_INTERSECTION)
+    with pytest.raises(InputError, match=r"limit of 10 m/s, 10\.35 m/s does"):
+        replace(scene, population=Population(towns=Towns(count=2, desired_speed_mps=(2.0, 10.0))))
+
+
+def test_a_headway_for_everybody_is_that_of_all_towns() -> None:
+    scene = replace(find_scene(T_INTERSECTION), population=MANY).with_drivers(None, 1.5)
+    assert {driver.idm.tau_s for driver in members(scene.population)} == {1.5}
+    assert scene.tau_s == 1.5

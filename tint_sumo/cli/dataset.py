@@ -8,15 +8,16 @@ from tyro.conf import Positional, Suppress, subcommand
 
 from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, flag_of, wrote
 from tint_sumo.cli.values import FolderOrUrl, MixFlag, PopulationValue, Scene, optional
-from tint_sumo.config import Mix, TrafficSeed, WindowCount
+from tint_sumo.config import POPULATIONS, Mix, TrafficSeed, WindowCount
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import PICTURE_SUFFIXES, require_output_file
 from tint_sumo.core.ranges import Processes
 
 _SUMOCFG = optional("FILE", "SUMO configuration in place of a scene: its network and demand, its vTypes as labels.")
 _POPULATION = optional(
-    "{traits,continuous}",
-    "traits: conservative and aggressive drivers. continuous: desired speeds and gaps of all kinds, without classes.",
+    f"{{{','.join(POPULATIONS)}}}",
+    "traits: conservative and aggressive drivers. continuous: desired speeds and gaps of all kinds, without classes. "
+    "same_speed, same_gap: traits that do not differ in it. towns, held_out_towns: each episode in a town.",
     "the scene's, traits in built-in scenes",
 )
 

@@ -8,7 +8,7 @@ from tyro.conf import arg
 
 from tint_sumo import ENV_IDS
 from tint_sumo.cli.configuration import FromFile, name_flag, one_of
-from tint_sumo.config import SENSORS, Fraction, TauS
+from tint_sumo.config import POPULATIONS, SENSORS, Fraction, TauS
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import Many, Where, choose
 
@@ -83,7 +83,7 @@ FolderOrUrl = Annotated[str, arg(metavar="FOLDER|URL")]  # a path would lose a s
 # Values are names, or what these make of a file.
 SceneValue = Annotated[Any, name_flag(), SCENE]
 SensorValue = Annotated[Any, name_flag(*SENSORS), SENSOR]
-PopulationValue = Annotated[Any, name_flag("traits", "continuous"), POPULATION]
+PopulationValue = Annotated[Any, name_flag(*POPULATIONS), POPULATION]
 BudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), BUDGET]
 PpoBudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), PPO_BUDGET]
 TraitBudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), TRAIT_BUDGET]

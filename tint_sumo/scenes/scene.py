@@ -108,8 +108,14 @@ class Scene:
         for building in self.buildings:
             if len(building) < 3 or not shapely.Polygon(building).is_valid:
                 raise InputError(f"buildings must have simple outlines of three corners or more, not {shown(building)}")
-        if not self.step_s <= self.tau_s < math.inf:  # with less, SUMO's drivers hit each other
-            raise InputError(f"tau_s must be at least a step of {self.step_s:g} s, and finite, not {self.tau_s}")
+        towns, least_tau_s = self.population.towns, self.population.least_tau_s
+        if towns is not None and towns.top_speed_mps > self.network.speed_limit_mps:
+            raise InputError(
+                f"desired_speed_mps and half of speed_shift_mps of towns must not exceed the roads' limit of "
+                f"{self.network.speed_limit_mps:g} m/s, {towns.top_speed_mps:g} m/s does"
+            )
+        if not self.step_s <= least_tau_s < math.inf:  # with less, SUMO's drivers hit each other
+            raise InputError(f"tau_s must be at least a step of {self.step_s:g} s, and finite, not {least_tau_s}")
 
     @property
     def traits(self) -> tuple[str, ...]:
@@ -123,8 +129,9 @@ class Scene:
 
     @property
     def tau_s(self) -> float:
-        """Time headway of the drivers."""
-        return self.population.idm.tau_s
+        """Time headway of the drivers; with towns, of the one in the middle of their range."""
+        towns = self.population.towns
+        return self.population.idm.tau_s if towns is None else sum(towns.tau_s) / 2
 
     @property
     def speed_limit_mps(self) -> float:
@@ -140,7 +147,7 @@ class Scene:
         """Return the scene with another mix and another time headway of its drivers, where they are given."""
         population, traffic = self.population, self.traffic
         if tau_s is not None:
-            population = replace(population, idm=replace(population.idm, tau_s=tau_s))
+            population = population.with_tau(tau_s)
         if p_conservative is not None:
             traffic = replace(traffic, p_conservative=p_conservative)
         return replace(self, traffic=traffic, population=population)

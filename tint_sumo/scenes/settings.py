@@ -12,6 +12,7 @@ from tint_sumo.config import (
     Claim,
     DistanceM,
     EgoController,
+    Population,
     Slots,
     StepS,
     TimeS,
@@ -58,7 +59,7 @@ class SceneSettings:
     claim: Claim
     """Conditions of the ego's claim on a lane, and of the drivers' reaction to it."""
     population: PopulationSetting
-    """Drivers: traits, continuous, a list of profiles, or a mapping of what differs from them."""
+    """Drivers: traits, towns or another name, a list of profiles, or a mapping of what differs from them."""
     arrivals_per_s: ArrivalsPerS | None
     """Rate of drivers who come on each route; null: as many as there is room for."""
     max_vehicles: Slots
@@ -117,8 +118,11 @@ class SceneSettings:
         )
 
     def _named(self) -> dict[str, Any]:
-        """Return the settings from which a name is made; without buildings it is that of earlier versions."""
-        return {name: value for name, value in plain(self).items() if name != "buildings" or value != []}
+        """Return the settings from which a name is made; without what is newer it is that of earlier versions."""
+        named = {name: value for name, value in plain(self).items() if name != "buildings" or value != []}
+        newer = {"towns": Population.towns, "car_following": Population.car_following}
+        drivers = {key: value for key, value in named["population"].items() if key not in newer or value != newer[key]}
+        return {**named, "population": drivers}
 
 
 @dataclass(frozen=True)

@@ -31,17 +31,17 @@ class Driver:
 
 
 class DriverPool:
-    """The drivers that all routes' streams draw from."""
+    """The drivers that all routes' streams draw from in an episode: those of a town."""
 
-    def __init__(self, population: tuple[DriverMember, ...], layout: Layout) -> None:
+    def __init__(self, population: tuple[DriverMember, ...], layout: Layout, town: int = 0) -> None:
         self.population = population
         self.scene = layout.scene
-        everybody = list(range(len(population)))
+        everybody = [index for index, member in enumerate(population) if member.town == town]
         self.by_trait = {  # where all drivers yield, or none does, all are drawn from
             yields: [index for index in everybody if population[index].profile.yields is yields] or everybody
             for yields in (True, False)
         }
-        self.mean_gap_m = float(np.mean([gap for member in population for gap in member.profile.entry_gap_m]))
+        self.mean_gap_m = float(np.mean([gap for index in everybody for gap in population[index].entry_gap_m]))
 
 
 class DriverStream:
@@ -61,7 +61,7 @@ class DriverStream:
         rng, pool, traffic = self._rng, self._pool, self._pool.scene.traffic
         candidates = pool.by_trait[bool(rng.random() < self._p_conservative)]
         member = candidates[int(rng.integers(len(candidates)))]
-        low_m, high_m = pool.population[member].profile.entry_gap_m
+        low_m, high_m = pool.population[member].entry_gap_m
         gap_m = low_m + (high_m - low_m) * rng.random()
         wait_s = 0.0 if traffic.arrivals_per_s is None else rng.exponential(1.0 / traffic.arrivals_per_s)
         return Driver(member, gap_m, wait_s)
@@ -88,7 +88,8 @@ class Demand:
     def __init__(self, replicas: int, population: tuple[DriverMember, ...], layout: Layout) -> None:
         shape = (replicas, len(layout.routes))
         self._layout = layout
-        self._pool = DriverPool(population, layout)
+        towns = sorted({member.town for member in population})
+        self._pools = [DriverPool(population, layout, town) for town in towns]
         self._streams: list[tuple[DriverStream, ...]] = [() for _ in range(replicas)]
         self._wanted_gap_m: Floats = np.full(shape, np.inf)
         self._wanted_time_s: Floats = np.zeros(shape)
@@ -102,10 +103,11 @@ class Demand:
 
     def begin(self, replica: int, seed: np.random.SeedSequence) -> list[PlacedVehicle]:
         """Start an episode; return the vehicles that are on the roads already."""
-        mix = self._pool.scene.traffic.p_conservative
-        p_conservative = np.random.default_rng(seed).uniform(mix.low, mix.high)
+        mix, rng = self._layout.scene.traffic.p_conservative, np.random.default_rng(seed)
+        p_conservative = rng.uniform(mix.low, mix.high)
+        pool = self._pools[int(rng.integers(len(self._pools)))]
         streams = tuple(
-            DriverStream(np.random.default_rng(child), self._pool, p_conservative)
+            DriverStream(np.random.default_rng(child), pool, p_conservative)
             for child in seed.spawn(len(self._layout.routes))
         )
         self._streams[replica] = streams

@@ -9,7 +9,8 @@ shipped policies and from the tables in data/results. The commands it runs are t
 
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import gymnasium
 import numpy as np
 import pandas
 import torch
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
@@ -24,13 +26,14 @@ from tint_sumo import ENV_IDS
 from tint_sumo.cli import main as tint_sumo
 from tint_sumo.comparisons.traits import TraitStudy
 from tint_sumo.comparisons.traits_report import plot_noise
-from tint_sumo.config import SENSORS, Sensor
+from tint_sumo.config import POPULATIONS, SENSORS, Sensor
 from tint_sumo.core.files import write_json
 from tint_sumo.envs import SceneEnv, TaskSettings
 from tint_sumo.methods.registry import Learned, find_method, needed_encoders
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.scenes import T_INTERSECTION
+from tint_sumo.scenes.drivers import DriverMember, members
 from tint_sumo.scenes.geometry import clearance_m
 from tint_sumo.simulation import SceneSimulation, Simulation
 from tint_sumo.study.budgets import BUDGETS
@@ -150,6 +153,27 @@ def perceived(sensor: Sensor) -> NDArray[np.uint8]:
     return picture
 
 
+def make_towns_picture(images: Path) -> None:
+    """Draw the headways, desired speeds and entry gaps of both traits in each town, in the order of their headways."""
+    drivers = members(replace(POPULATIONS["towns"], members=1))  # drivers of a trait differ in minimum gaps alone
+    towns = sorted(zip(drivers[::2], drivers[1::2], strict=True), key=lambda pair: sum(one.idm.tau_s for one in pair))
+    channels: dict[str, Callable[[DriverMember], float]] = {
+        "time headway (s)": lambda driver: driver.idm.tau_s,
+        "desired speed (m/s)": lambda driver: driver.desired_speed_mps,
+        "mean gap at entry (m)": lambda driver: sum(driver.entry_gap_m) / 2,
+    }
+    figure = Figure(figsize=(9.0, 7.0), dpi=100, layout="constrained")
+    for axes, (name, value) in zip(figure.subplots(3, 1, sharex=True), channels.items(), strict=True):
+        levels = np.array([[value(driver) for driver in pair] for pair in towns])
+        axes.vlines(range(len(towns)), *levels.T, color="0.8", linewidth=1.0)
+        for column, profile in enumerate(POPULATIONS["towns"].profiles):
+            axes.plot(levels[:, column], "o", color=profile.rgb, markersize=3.0, label=profile.name)
+        axes.set_ylabel(name)
+    figure.axes[0].legend(loc="upper left")
+    figure.axes[-1].set_xlabel("towns, in the order of their headways")
+    figure.savefig(images / "towns.png")
+
+
 def sheet_of(pictures: Mapping[str, NDArray[np.uint8]], columns: int) -> Image.Image:
     """All pictures in rows, each below its name."""
     titled = [titled_picture(name, picture) for name, picture in pictures.items()]
@@ -219,10 +243,12 @@ if __name__ == "__main__":
         make_figures(IMAGES)
         make_pictures(IMAGES)
         make_sensor_pictures(IMAGES)
+        make_towns_picture(IMAGES)
         make_films()
         sys.exit()
     make_pictures(IMAGES)
     make_sensor_pictures(IMAGES)
+    make_towns_picture(IMAGES)
     make_traits(Path(sys.argv[1]))
     make_policies(Path(sys.argv[1]))
     make_figures(IMAGES)

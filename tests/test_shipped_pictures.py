@@ -38,6 +38,11 @@ def test_pictures_of_sensors_show_the_same_moment(make_shipped: ModuleType, tmp_
     assert_pictures_are_shipped(tmp_path, {"sensors.png"})
 
 
+def test_the_picture_of_towns_shows_the_population(make_shipped: ModuleType, tmp_path: Path) -> None:
+    make_shipped.make_towns_picture(tmp_path)
+    assert_pictures_are_shipped(tmp_path, {"towns.png"})
+
+
 def assert_pictures_are_shipped(folder: Path, names: set[str]) -> None:
     """Compare pictures in a folder with those in data/images, but for the edges of letters, which fonts decide."""
     assert {file.name for file in folder.iterdir()} == names

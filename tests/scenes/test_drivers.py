@@ -126,12 +126,11 @@ def test_an_episode_draws_from_the_drivers_of_one_town_whatever_the_batch() -> N
     scene = replace(find_scene(T_INTERSECTION), population=replace(MANY, towns=replace(TOWNS, count=20)))
     drivers, towns = members(scene.population), []
     for seed in range(40):
-        placed = [
-            Demand(replicas, drivers, layout(scene)).begin(replicas - 1, np.random.SeedSequence(seed))
-            for replicas in (1, 3)
-        ]
+        demands = [Demand(replicas, drivers, layout(scene)) for replicas in (1, 3)]
+        placed = [demand.begin(len(demand.town) - 1, np.random.SeedSequence(seed)) for demand in demands]
         assert placed[0] == placed[1]
         (town,) = {drivers[vehicle.member].town for vehicle in placed[0]}
+        assert {int(demand.town[-1]) for demand in demands} == {town}
         towns.append(town)
     assert len(set(towns)) > 10
 

@@ -89,7 +89,8 @@ class Demand:
         shape = (replicas, len(layout.routes))
         self._layout = layout
         towns = sorted({member.town for member in population})
-        self._pools = [DriverPool(population, layout, town) for town in towns]
+        self.town: Numbers = np.full(replicas, towns[0])  # number of the town of each replica's episode
+        self._towns, self._pools = towns, [DriverPool(population, layout, town) for town in towns]
         self._streams: list[tuple[DriverStream, ...]] = [() for _ in range(replicas)]
         self._wanted_gap_m: Floats = np.full(shape, np.inf)
         self._wanted_time_s: Floats = np.zeros(shape)
@@ -105,7 +106,8 @@ class Demand:
         """Start an episode; return the vehicles that are on the roads already."""
         mix, rng = self._layout.scene.traffic.p_conservative, np.random.default_rng(seed)
         p_conservative = rng.uniform(mix.low, mix.high)
-        pool = self._pools[int(rng.integers(len(self._pools)))]
+        drawn = int(rng.integers(len(self._pools)))
+        pool, self.town[replica] = self._pools[drawn], self._towns[drawn]
         streams = tuple(
             DriverStream(np.random.default_rng(child), pool, p_conservative)
             for child in seed.spawn(len(self._layout.routes))

@@ -1,10 +1,12 @@
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from sumolib.shapes import polygon
 
+from tint_sumo.config import POPULATIONS, Towns
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
 from tint_sumo.scenes import SCENES, T_INTERSECTION, find_scene
@@ -30,6 +32,18 @@ def test_plain_sumo_runs_every_scene(name: str, routes: str, tmp_path: Path) -> 
     inserted = next(line for line in result.stdout.splitlines() if "Inserted:" in line)
     assert int(inserted.split()[1]) > 10
     assert "collision" not in result.stderr.lower()
+
+
+def test_plain_sumo_runs_a_town(tmp_path: Path) -> None:
+    drivers = replace(POPULATIONS["towns"], towns=Towns(only=5))
+    write_scene(tmp_path, replace(T, population=drivers), replicas=1)
+    command = [sumo_program("sumo"), "-c", str(tmp_path / CONFIG_FILE), "--end", "100"]
+    result = subprocess.run(
+        [*command, "--vehroute-output", "driven.xml"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert "collision" not in result.stderr.lower()
+    driven = {entry.attrib["type"] for entry in ElementTree.parse(tmp_path / "driven.xml").iter("vehicle")}
+    assert len(driven) > 5 and {name.split(".")[1] for name in driven} == {"5"}
 
 
 def test_buildings_are_polygons_that_sumo_reads(tmp_path: Path) -> None:

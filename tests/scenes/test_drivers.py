@@ -122,6 +122,15 @@ def test_drivers_differ_from_their_town_by_its_shifts() -> None:
             assert abs(driver.min_gap_m / town.min_gap_factor - gap_m) <= 0.1 + 1e-3
 
 
+def test_nothing_but_yielding_tells_drivers_apart_where_no_shift_differs() -> None:
+    drivers = members(replace(MANY, towns=replace(TOWNS, alike=1.0)))
+    for yielding, hasty in zip(drivers[::2], drivers[1::2], strict=True):
+        assert (yielding.idm, yielding.desired_speed_mps) == (hasty.idm, hasty.desired_speed_mps)
+        assert yielding.entry_gap_m == pytest.approx(hasty.entry_gap_m)
+    gaps_m = np.array([driver.min_gap_m for driver in drivers]).reshape(-1, 2)
+    assert abs(np.subtract(*gaps_m.T).mean()) < 0.02
+
+
 def test_an_episode_draws_from_the_drivers_of_one_town_whatever_the_batch() -> None:
     scene = replace(find_scene(T_INTERSECTION), population=replace(MANY, towns=replace(TOWNS, count=20)))
     drivers, towns = members(scene.population), []

@@ -3,6 +3,7 @@
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -129,6 +130,35 @@ def test_stable_baselines_has_them_too(user_network: Make) -> None:
         env.step(np.array([2]))
     finally:
         env.close()
+
+
+def test_an_ego_that_sumo_takes_away_ends_an_episode_as_lost(user_network: Make) -> None:
+    network = user_network("merge")
+    impatient = network.sumocfg.with_name("impatient.sumocfg")
+    text = network.sumocfg.read_text()
+    impatient.write_text(text.replace("</configuration>", '<time-to-teleport value="2"/></configuration>'))
+    settings = TaskSettings(replace(network, sumocfg=impatient).scene(warm_up_s=1.0))
+    with made(settings.played) as env:
+        env.reset(seed=1)
+        answer = env.step(0)
+        while not (answer[2] or answer[3]):
+            answer = env.step(0)
+        _, reward, terminated, truncated, info = answer
+    assert (info["outcome"], info["is_success"], terminated, truncated) == ("lost", False, False, True)
+    assert reward == sum(info["reward_terms"].values()) <= 0.0
+    with closing(SceneVectorEnv(1, settings)) as vector:
+        vector.reset(seed=1)
+        end = next(answer for answer in iter(lambda: vector.step(np.array([0])), None) if answer[2][0] or answer[3][0])
+        assert (end[4]["outcome"][0], end[2][0], end[3][0]) == ("lost", False, True)
+    venv = SceneVecEnv(1, settings, seed=1)
+    try:
+        venv.reset()
+        done = np.array([False])
+        while not done[0]:
+            _, _, done, (info,) = venv.step(np.array([0]))
+        assert (info["outcome"], info["TimeLimit.truncated"]) == ("lost", True)
+    finally:
+        venv.close()
 
 
 @pytest.mark.parametrize("settings", [{"p_conservative": 0.5}, {"tau_s": 1.5}])

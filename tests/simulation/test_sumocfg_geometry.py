@@ -12,6 +12,7 @@ import pytest
 
 from tests.scenes.networks import write_config
 from tint_sumo.config import Backend, EgoController
+from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, TaskSettings
 from tint_sumo.envs.rendering import render_scene
 from tint_sumo.scenes import SumocfgScene, from_sumocfg
@@ -120,6 +121,21 @@ def test_the_ego_keeps_its_route_whoever_reroutes(backend: Backend, make: Make) 
         assert not simulation.egos.lost[0]
         assert "off" not in roads
         assert "on" in roads
+
+
+@pytest.mark.parametrize(
+    ("remover", "message"),
+    [
+        ('<vaporizer id="wm" begin="0" end="999"/>', "or a vaporizer lets none in"),
+        (
+            '<calibrator id="c" edge="wm" pos="20.1" period="9"><flow begin="0" end="9" vehsPerHour="0"/></calibrator>',
+            "SUMO takes the ego off the road where it starts",
+        ),
+    ],
+)
+def test_an_ego_that_is_removed_where_it_starts_is_refused(remover: str, message: str, make: Make) -> None:
+    with pytest.raises(InputError, match=message), begun(make("", additional=remover)):
+        pass
 
 
 def test_the_end_of_the_route_can_be_the_goal(make: Make) -> None:

@@ -151,7 +151,10 @@ class SumocfgSimulation(Simulation):
             self._let_ego_enter()
             self._look_as_far_as_needed()
             self._way = EgoWay(self.connection, self.scene.departure[0])
-            sight = self.connection.vehicle.getContextSubscriptionResults(EGO)[EGO]
+            seen = self.connection.vehicle.getContextSubscriptionResults(EGO)
+        if EGO not in seen:
+            raise self._taken_at_start()
+        sight = seen[EGO]
         self._drives = True
         x_m, y_m, *_ = box_of(sight, self._ego_size_m, (0.0, 0.0))
         self.origin_m = (x_m, y_m)
@@ -195,6 +198,8 @@ class SumocfgSimulation(Simulation):
         vehicle.add(EGO, EGO, typeID=EGO, departLane="best", departPos=str(lane_pos_m), departSpeed="0")
         for _ in range(math.ceil(_ENTRY_PATIENCE_S / scene.step_s)):
             self.connection.step()
+            if EGO in self.connection.simulation.getArrivedIDList():
+                raise self._taken_at_start()
             if EGO in self.connection.simulation.getDepartedIDList():
                 vehicle.setSpeedMode(EGO, SPEED_MODE_OBEY_SETSPEED)
                 vehicle.setLaneChangeMode(EGO, _ONLY_STRATEGIC_CHANGES)
@@ -202,7 +207,13 @@ class SumocfgSimulation(Simulation):
                 return
         raise InputError(
             f"the ego found no room at its start ({scene.start_m:g} m) for {_ENTRY_PATIENCE_S:g} s: vehicles stand or "
-            "enter there; choose another start_m or warm_up_s"
+            "enter there, or a vaporizer lets none in; choose another start_m or warm_up_s"
+        )
+
+    def _taken_at_start(self) -> InputError:
+        return InputError(
+            f"SUMO takes the ego off the road where it starts ({self.scene.start_m:g} m), as calibrators do; "
+            "choose another start_m"
         )
 
     # Steps

@@ -33,6 +33,7 @@ POSITION_SCALE_M = 20.0  # positions are observed divided by this (code)
 SPEED_SCALE_MPS = 3.0  # velocities are observed divided by this: the ego's top desired speed
 
 Backend = Literal["auto", "libsumo", "traci"]
+EgoControl = Literal["speed", "sumo"]
 
 # Numbers that several settings have, with what is sensible; larger ones would fill the memory, or are mistakes.
 Fraction = Annotated[float, Range(0.0, 1.0)]

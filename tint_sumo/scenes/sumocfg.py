@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, get_args
 from xml.sax import SAXException
 
 import shapely
@@ -19,6 +19,7 @@ import sumolib
 from tint_sumo.config import (
     SPEED_SCALE_MPS,
     DistanceM,
+    EgoControl,
     EgoController,
     Slots,
     TimeS,
@@ -26,7 +27,7 @@ from tint_sumo.config import (
     WarmStarts,
     WarmUpS,
 )
-from tint_sumo.core.errors import InputError
+from tint_sumo.core.errors import InputError, shown
 from tint_sumo.core.ranges import require_ranges
 from tint_sumo.core.reading import TABLE_BYTES, require_file
 from tint_sumo.scenes.roads import Roads, crossing_marks, paved_areas
@@ -66,9 +67,12 @@ class SumocfgScene:
     time_limit_s: TimeS = 50.0
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     controller: EgoController = field(default_factory=EgoController)
+    ego_control: EgoControl = "speed"  # "sumo": SUMO's driver drives the ego, whatever the actions are
 
     def __post_init__(self) -> None:
         require_ranges(self)
+        if self.ego_control not in get_args(EgoControl):
+            raise InputError(f"ego_control must be 'speed' or 'sumo', not {shown(self.ego_control)}")
 
     @property
     def sumocfg(self) -> Path:
@@ -136,6 +140,7 @@ def from_sumocfg(
     time_limit_s: float = SumocfgScene.time_limit_s,
     vehicle: VehicleShape | None = None,
     controller: EgoController | None = None,
+    ego_control: EgoControl = SumocfgScene.ego_control,
 ) -> SumocfgScene:
     """Return a scene of the configuration's network and demand.
 
@@ -152,6 +157,9 @@ def from_sumocfg(
         time_limit_s: of an episode.
         vehicle: the ego's shape.
         controller: of the ego; its desired speeds are the actions.
+        ego_control: "sumo" lets SUMO's driver of a default passenger car drive the ego, up to its highest desired
+            speed and the speed limit, as a baseline on the same cases: it obeys traffic lights and the right of way,
+            keeps its distance, and takes no notice of actions.
 
     Raises:
         InputError: files are missing or of a newer SUMO, the route does not exist or is not connected, or the ego's
@@ -184,6 +192,7 @@ def from_sumocfg(
         time_limit_s=time_limit_s,
         vehicle=vehicle or VehicleShape(),
         controller=controller or EgoController(),
+        ego_control=ego_control,
     )
 
 

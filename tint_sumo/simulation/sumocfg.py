@@ -31,6 +31,8 @@ from tint_sumo.simulation.sumo import SPEED_MODE_OBEY_SETSPEED
 from tint_sumo.simulation.warm_starts import WarmStarts
 
 _ONLY_STRATEGIC_CHANGES = 513  # lane changes: those that the route asks for, where there is room
+_SUMO_DRIVES = -1.0  # in place of a speed
+_SUMO_SPEED_MODE, _SUMO_LANE_CHANGE_MODE = 31, 1621  # SUMO's defaults: all its rules
 _REROUTING = "has.rerouting.device"
 _ENTRY_PATIENCE_S = 60.0  # the ego waits for room at its start for so long
 _SEEN = (
@@ -121,6 +123,7 @@ class SumocfgSimulation(Simulation):
         self._any_long = False
         self.persons = Persons(scene, self.connection)
         self._drives = False
+        self._accel_mps2 = 0.0  # of the ego, where SUMO drives it
         self.slot: dict[str, int] = {}
         self._number: dict[str, int] = {}  # number of each vehicle that has been seen
 
@@ -201,14 +204,27 @@ class SumocfgSimulation(Simulation):
             if EGO in self.connection.simulation.getArrivedIDList():
                 raise self._taken_at_start()
             if EGO in self.connection.simulation.getDepartedIDList():
-                vehicle.setSpeedMode(EGO, SPEED_MODE_OBEY_SETSPEED)
-                vehicle.setLaneChangeMode(EGO, _ONLY_STRATEGIC_CHANGES)
-                vehicle.setSpeed(EGO, 0.0)
+                if scene.ego_control == "sumo":
+                    self._hand_over_ego()
+                else:
+                    vehicle.setSpeedMode(EGO, SPEED_MODE_OBEY_SETSPEED)
+                    vehicle.setLaneChangeMode(EGO, _ONLY_STRATEGIC_CHANGES)
+                    vehicle.setSpeed(EGO, 0.0)
                 return
         raise InputError(
             f"the ego found no room at its start ({scene.start_m:g} m) for {_ENTRY_PATIENCE_S:g} s: vehicles stand or "
             "enter there, or a vaporizer lets none in; choose another start_m or warm_up_s"
         )
+
+    def _hand_over_ego(self) -> None:
+        """Let SUMO's driver of a default passenger car drive the ego, which has entered as in all other episodes."""
+        types, vehicle = self.connection.vehicletype, self.connection.vehicle
+        types.setMinGap(EGO, types.getMinGap(DEFAULT_VTYPE))
+        types.setMaxSpeed(EGO, max(self.scene.controller.desired_speeds_mps))
+        vehicle.setSpeedMode(EGO, _SUMO_SPEED_MODE)
+        vehicle.setLaneChangeMode(EGO, _SUMO_LANE_CHANGE_MODE)
+        vehicle.setSpeed(EGO, _SUMO_DRIVES)
+        self._accel_mps2 = float(types.getAccel(EGO))
 
     def _taken_at_start(self) -> InputError:
         return InputError(
@@ -226,15 +242,23 @@ class SumocfgSimulation(Simulation):
         """
         if not self._drives:
             return
-        self.egos.drive(desired_speed_mps)
         with self._refusals:
-            self.connection.vehicle.setSpeed(EGO, float(self.egos.speed_mps[0]))
+            moved_m = self._drive(desired_speed_mps) * self.scene.step_s
             self.connection.step()
-            fate = self._way.look(float(self.egos.speed_mps[0]) * self.scene.step_s)
+            fate = self._way.look(moved_m)
         if fate is Fate.DRIVES:
             self._look()
         else:
             self._end(fate)
+
+    def _drive(self, desired_speed_mps: Floats) -> float:
+        """Choose the ego's speed in this step, if SUMO does not; return it, or the highest that SUMO may choose."""
+        if self.scene.ego_control == "sumo":
+            return float(self.egos.speed_mps[0]) + self._accel_mps2 * self.scene.step_s
+        self.egos.drive(desired_speed_mps)
+        speed_mps = float(self.egos.speed_mps[0])
+        self.connection.vehicle.setSpeed(EGO, speed_mps)
+        return speed_mps
 
     def _end(self, fate: Fate) -> None:
         """Leave all as it was at last: the ego has come to its route's end, or SUMO has taken it away."""

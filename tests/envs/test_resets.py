@@ -29,7 +29,8 @@ def state(episodes: Episodes) -> dict[str, Any]:
         for name, value in vars(part).items()
         if isinstance(value, np.ndarray | list) and len(value) == simulation.replicas and name != "_newcomer"
     }
-    found.pop("Demand._streams", None)  # objects, which are new in every episode
+    for objects in ("_streams", "_pools", "_towns"):
+        found.pop(f"Demand.{objects}", None)
     sensing = episodes.sensing
     assert sensing._normals is not None
     noise = [rng and rng.bit_generator.state for rng in sensing._normals._generators]

@@ -11,7 +11,7 @@ from PIL import Image
 
 from tests.study.scenes import given, trained
 from tint_sumo.config import ALL_MIXES, Mix
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import METHODS
 from tint_sumo.study import figures
 from tint_sumo.study.budgets import Conditions
@@ -82,7 +82,7 @@ def test_the_paper_s_success_is_marked_where_there_is_one(tmp_path: Path, drawn:
     assert marked["P(conservative) = 0.25"] == [85.0] and marked["P(conservative) = 0.4"] == [90.0]
     assert marked["P(conservative) = 0.9"] == []
     entries = [text.get_text() for text in drawn().legends[0].get_texts()]
-    assert sorted(entries) == sorted([*OUTCOMES, "95 % interval of success", "success in the paper"])
+    assert sorted(entries) == sorted([*BUILT_IN_OUTCOMES, "95 % interval of success", "success in the paper"])
 
 
 def test_no_label_of_a_bar_rounds_to_all_or_to_the_even_number(tmp_path: Path, drawn: Callable[[], Figure]) -> None:

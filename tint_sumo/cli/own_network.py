@@ -6,9 +6,8 @@ from typing import Annotated, Any
 
 from tint_sumo.cli.command import Command, flag_of
 from tint_sumo.cli.values import EGO_ROUTE_HELP, edges_of, optional
-from tint_sumo.config import EgoController, SpeedMps, TimeS, WarmStarts, WarmUpS
+from tint_sumo.config import EgoController, RouteM, SpeedMps, TimeS, WarmStarts, WarmUpS
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import Many
 
 _SUMOCFG = optional("FILE", "SUMO configuration in place of a scene: its network, its demand, its vTypes as labels.")
@@ -27,7 +26,6 @@ _WARM_STARTS = optional(
 )
 _TIME_LIMIT = optional("FLOAT", "Longest time of an episode, s; with --sumocfg.", "50")
 _TASK = ("ego_route", "start_m", "goal_m", "speeds_mps", "warm_up_s", "warm_starts", "time_limit_s")
-_RouteM = Annotated[float, Range(0.0, 1e6)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +34,8 @@ class NetworkCommand(Command):
 
     sumocfg: Annotated[Path | None, _SUMOCFG] = None
     ego_route: Annotated[Many[str] | None, _ROUTE] = None
-    start_m: Annotated[_RouteM | None, _START] = None
-    goal_m: Annotated[_RouteM | None, _GOAL] = None
+    start_m: Annotated[RouteM | None, _START] = None
+    goal_m: Annotated[RouteM | None, _GOAL] = None
     speeds_mps: Annotated[Many[SpeedMps] | None, _SPEEDS] = None
     warm_up_s: Annotated[WarmUpS | None, _WARM_UP] = None
     warm_starts: Annotated[WarmStarts | None, _WARM_STARTS] = None

@@ -8,6 +8,7 @@ from tyro.conf import Positional, Suppress, subcommand
 
 from tint_sumo.cli.command import Command, Outcome, wrote
 from tint_sumo.cli.values import EGO_ROUTE_HELP, edges_of, optional
+from tint_sumo.config import RouteM
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import PICTURE_SUFFIXES, require_output_file
 from tint_sumo.core.structures import Many
@@ -24,8 +25,8 @@ class CheckScene(Command):
     sumocfg: Positional[Path]
     """SUMO configuration (.sumocfg)."""
     ego_route: Annotated[Many[str] | None, _EGO_ROUTE] = None
-    start_m: Annotated[float | None, _START] = None
-    goal_m: Annotated[float | None, _GOAL] = None
+    start_m: Annotated[RouteM | None, _START] = None
+    goal_m: Annotated[RouteM | None, _GOAL] = None
     figure: Annotated[Path | None, optional("FILE", "Picture to write: .png, .jpg, .webp, .svg or .pdf.")] = None
 
     def run(self) -> Outcome:

@@ -151,13 +151,12 @@ class RayCluster:
 
     @contextmanager
     def map(self, work: Work[T], numbers: Iterable[int]) -> Iterator[Iterator[T]]:
-        pending: deque[_Piece[T]] = deque()
-        try:
-            yield self._ahead(work, iter(numbers), pending)
-        finally:
-            _cancel([piece.task for piece in pending if piece.task is not None])
+        # Pieces that nobody takes run to their end. Ray 2.60 has ended the whole program, now and then, where one was
+        # cancelled at the moment at which it ended.
+        yield self._ahead(work, iter(numbers))
 
-    def _ahead(self, work: Work[T], numbers: Iterator[int], pending: "deque[_Piece[T]]") -> Iterator[T]:
+    def _ahead(self, work: Work[T], numbers: Iterator[int]) -> Iterator[T]:
+        pending: deque[_Piece[T]] = deque()
         while True:
             free = PIECES_PER_CPU * self.slots - len(pending)  # nodes come and go
             pending.extend(_Piece(work, number) for number in islice(numbers, max(free, 0)))
@@ -200,14 +199,6 @@ class _Piece(Generic[T]):
             if self._ends[how] >= MAX_ATTEMPTS[how]:
                 raise JobError(f"piece {self._number} {how} {self._ends[how]} times: {last_line(str(content))}")
             self.task = self._submit()
-
-
-def _cancel(tasks: list[Any]) -> None:
-    """Cancel pieces of work and wait until they have ended."""
-    for task in tasks:
-        ray.cancel(task)  # by force it would bring this process down, now and then, where the piece ends at that moment
-    if tasks:
-        ray.wait(tasks, num_returns=len(tasks), timeout=INTERRUPT_S)
 
 
 def _end_of(task: Any, out: Path) -> tuple[How, Any]:

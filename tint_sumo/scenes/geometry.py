@@ -246,3 +246,43 @@ def measure_distances_m(egos: Boxes, present: Bools, vehicles: Boxes, reach_m: f
                 near_m = reach_m + ego_radius_m + math.hypot(other.length_m, other.width_m) / 2
                 if abs(other.x_m - ego.x_m) < near_m and abs(other.y_m - ego.y_m) < near_m:
                     distance_m[row, slot] = clearance_m(ego, other)
+
+
+@compiled
+def sweep(
+    egos_before: Boxes, egos: Boxes, same: Bools, before: Boxes, vehicles: Boxes, parts: int, hit: Numbers
+) -> bool:
+    """Write which vehicles egos have touched between two steps, if all drive straight on at a constant speed.
+
+    Args:
+        egos_before, egos: (R,) boxes.
+        same: (R, V) slots with the same vehicle at both times.
+        before, vehicles: (R, V) boxes.
+        parts: of the step, at whose ends within it boxes are compared.
+        hit: (R,) the first slot whose vehicle the ego has touched, written where it was negative.
+
+    Returns:
+        whether any ego has touched a vehicle for the first time.
+    """
+    any_new = False
+    ego, vehicle = egos[:1].copy(), egos[:1].copy()
+    for row in range(len(egos)):
+        for part in range(1, parts):
+            share = part / parts
+            between(egos_before[row], egos[row], share, ego[0])
+            for slot in range(same.shape[1]):
+                if hit[row] < 0 and same[row, slot]:
+                    between(before[row, slot], vehicles[row, slot], share, vehicle[0])
+                    if clearance_m(ego[0], vehicle[0]) == 0.0:
+                        hit[row] = slot
+                        any_new = True
+    return any_new
+
+
+@compiled
+def between(first: Any, last: Any, share: float, box: Any) -> None:
+    """Write the box at a share of the way from one box to another, whose heading it has."""
+    box.x_m = first.x_m + share * (last.x_m - first.x_m)
+    box.y_m = first.y_m + share * (last.y_m - first.y_m)
+    box.heading_x, box.heading_y = last.heading_x, last.heading_y
+    box.length_m, box.width_m = last.length_m, last.width_m

@@ -14,6 +14,7 @@ import shapely
 from tint_sumo.config import (
     SPEED_SCALE_MPS,
     Claim,
+    CoordinateM,
     EgoController,
     Mix,
     Population,
@@ -29,7 +30,7 @@ from tint_sumo.scenes.digest import scene_digest
 from tint_sumo.scenes.network import Network, Point
 
 BUILDING = "building"  # type of its polygon in SUMO
-Building = tuple[Point, ...]  # its corners, in order
+Building = tuple[tuple[CoordinateM, CoordinateM], ...]  # its corners, in order
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 from tint_sumo.config import (
     ArrivalsPerS,
@@ -13,6 +13,7 @@ from tint_sumo.config import (
     DistanceM,
     EgoController,
     Population,
+    RouteM,
     Slots,
     StepS,
     TimeS,
@@ -21,7 +22,7 @@ from tint_sumo.config import (
     WarmUpS,
 )
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.ranges import Range, require_ranges
+from tint_sumo.core.ranges import require_ranges
 from tint_sumo.core.structures import (
     FieldError,
     Many,
@@ -38,8 +39,6 @@ from tint_sumo.scenes.drivers import PopulationSetting
 from tint_sumo.scenes.registry import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, digest_of, find_scene, find_scenes
 from tint_sumo.scenes.scene import Building, Scene, require_scene_name
 from tint_sumo.scenes.sumocfg import SumocfgScene, from_sumocfg
-
-RouteM = Annotated[float, Range(0.0, 1e6)]
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from libsumo import constants
 
-from tint_sumo.scenes.geometry import BOX, NO_VEHICLE, Bools, Boxes, measure_distances_m
+from tint_sumo.scenes.geometry import BOX, NO_VEHICLE, Bools, Boxes, measure_distances_m, sweep
 from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation.bodies import box_of
 from tint_sumo.simulation.connection import Connection
-from tint_sumo.simulation.ego import Egos, check_safety, sweep
+from tint_sumo.simulation.ego import Egos, check_safety
 from tint_sumo.simulation.ego_way import EGO
 
 _SEEN = (

@@ -52,6 +52,7 @@ def test_sumos_driver_stops_at_a_red_light_that_actions_pass(by_actions: Sumocfg
         front_m, passed = drive_through(simulation, _TOP_MPS)
         assert passed == ["G"]
         assert front_m[-1] > by_actions.goal_m
+        assert max(np.diff(front_m)) > 5.0 * by_actions.step_s, "it drives as fast as it may, not at a set speed"
         assert not simulation.egos.collided[0]
 
 

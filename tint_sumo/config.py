@@ -359,7 +359,7 @@ class EgoController:
 
 @dataclass(frozen=True)
 class Sensor:
-    """How the ego perceives the other vehicles; the default is a perfect sensor, which sees all of them as they are.
+    """Settings of the ego's perception of other vehicles; the default is perfect, and sees all of them as they are.
 
     A vehicle is seen if its centre is within the range and the field of view, if nothing hides it, and while the sensor
     has not lost it. The eye is above the ego's centre. ``occlusion``: a vehicle is hidden where buildings or boxes of

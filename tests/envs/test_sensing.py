@@ -1,4 +1,4 @@
-"""Sensors of the egos: statistics of noise and dropouts, tracks, delays, and what must not be told."""
+"""Sensors of the egos: statistics of noise and dropouts, tracks, delays, and observations without hidden vehicles."""
 
 import math
 from collections.abc import Iterator

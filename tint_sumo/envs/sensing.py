@@ -28,8 +28,9 @@ class Sensing:
     ============ ==========================================================================================
 
     A sensor that sees all vehicles shows them in the simulation's slots. One that does not gives them slots by what it
-    sees alone, so that nothing tells of the hidden ones: a new track takes the first slot that is empty and was so at
-    the step before, the nearest first where there are several. All that is random follows from the episode's seed.
+    sees alone, so that slots say nothing about hidden vehicles: a new track takes the first slot that is empty and was
+    so at the step before, the nearest first where there are several. All that is random follows from the episode's
+    seed.
     """
 
     def __init__(self, sensor: Sensor, simulation: Simulation, step_s: float) -> None:
@@ -104,7 +105,7 @@ class Sensing:
 
 
 class Memory(NamedTuple):
-    """How noise and dropouts go on from step to step, so that they have the same statistics at any step length."""
+    """Factors and probabilities of a step for noise and dropouts, whose statistics are the same at any step length."""
 
     keep: float  # part of the noise that stays
     renew: float  # times a new draw, so that the variance stays as it is

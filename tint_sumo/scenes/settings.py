@@ -68,8 +68,8 @@ class SceneSettings:
     time_limit_s: TimeS
     """Longest time of an episode."""
     buildings: DistanceM | tuple[Building, ...] = ()
-    """What hides vehicles from a sensor with occlusion: outlines, each a list of x and y of its corners; or a number,
-    for a building at each corner of the roads, so many m from them."""
+    """Buildings that hide vehicles from a sensor with occlusion: outlines, each a list of x and y of its corners; or a
+    number, for a building at each corner of the roads, so many m from them."""
 
     def __post_init__(self) -> None:
         if self.name in SCENES:

@@ -21,7 +21,7 @@ _JUNCTION = ":"  # edges on junctions begin so
 
 
 class Fate(Enum):
-    """What became of the ego in a step."""
+    """State of the ego after a step."""
 
     DRIVES = auto()
     ARRIVED = auto()  # at the end of its route
@@ -48,7 +48,7 @@ class EgoWay:
         self._is_on(found)
 
     def look(self, moved_m: float) -> Fate:
-        """Return what became of the ego in a step of this length; put it back on its route if it was rerouted."""
+        """Return the ego's state after a step of this length; put it back on its route if it was rerouted."""
         found = self._connection.vehicle.getSubscriptionResults(EGO)
         if EGO in self._connection.simulation.getStartingTeleportIDList():
             return Fate.LOST

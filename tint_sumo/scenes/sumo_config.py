@@ -157,17 +157,20 @@ def _ask_sumo(file: Path) -> list[tuple[str, str, str]]:
             result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_READING_LIMIT_S)
             root = ElementTree.fromstring(result.stdout[max(result.stdout.find("<?xml"), 0) :])
         except subprocess.TimeoutExpired:
-            raise InputError(
-                f"SUMO has not read {file} in {_READING_LIMIT_S:g} s; try it with: sumo -c {file}"
-            ) from None
+            raise refused(f"has not read {file} in {_READING_LIMIT_S:g} s", file) from None
         except ElementTree.ParseError:
             reason = first_reason(result.stderr.replace(str(there), here))
-            raise InputError(f"SUMO does not read {file} ({reason}); try it with: sumo -c {file}") from None
+            raise refused(f"does not read {file} ({reason})", file) from None
         return [
             (section.tag, option.tag, _VARIABLE.sub(_value_of, option.get("value", "")).replace(str(there), here))
             for section in root
             for option in section
         ]
+
+
+def refused(problem: str, file: Path) -> InputError:
+    """Return the error that SUMO has a problem with a configuration, with the way to see it."""
+    return InputError(f"SUMO {problem}; try it with: sumo -c {file}")
 
 
 def first_reason(printed: str) -> str:

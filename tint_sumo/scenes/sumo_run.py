@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tint_sumo.core.errors import InputError
-from tint_sumo.scenes.sumo_config import SumoConfig, first_reason
+from tint_sumo.scenes.sumo_config import SumoConfig, first_reason, refused
 
 _SEED_BITS = 31
 _UP = "../" * 64  # from any folder to the root
@@ -84,4 +83,4 @@ def _require_loads(config: SumoConfig, _digest: str) -> None:
         result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode != 0:
         reason = first_reason(result.stderr) or f"it ends with code {result.returncode}"
-        raise InputError(f"SUMO does not run {config.file} ({reason}); try it with: sumo -c {config.file}")
+        raise refused(f"does not run {config.file} ({reason})", config.file)

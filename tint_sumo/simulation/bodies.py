@@ -50,7 +50,7 @@ class Bodies:
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._behind: dict[tuple[str, str], tuple[str, ...]] = {}  # lanes that lead from an edge to a lane, last first
+        self._behind: dict[tuple[str, str], str | None] = {}  # lane before a lane, for those who come from an edge
 
     def pieces(self, vehicle_id: str, size_m: tuple[float, float], angle_rad: float) -> list[Box]:
         """Return the pieces of a vehicle's body, the front first, in the network's frame.
@@ -117,23 +117,21 @@ class Bodies:
         target = (route[before], lane)
         if target not in self._behind:
             self._behind[target] = self._find(route[before], lane)
-        found = self._behind[target]
-        return found[0] if found else None
+        return self._behind[target]
 
-    def _find(self, edge: str, lane: str) -> tuple[str, ...]:
-        """Return the lanes from an edge's lane to another lane, the last of them first; none if they do not meet."""
+    def _find(self, edge: str, lane: str) -> str | None:
+        """Return the lane from which those who come from an edge reach a lane; None if they do not."""
         lanes = self._connection.lane
         for number in range(self._connection.edge.getLaneNumber(edge)):
             first = f"{edge}_{number}"
             for link in lanes.getLinks(first):
-                way, after = [first], link[4] or link[0]
+                before, after = first, link[4] or link[0]
                 while after != lane and after.startswith(":"):
-                    way.append(after)
                     follow = lanes.getLinks(after)[0]
-                    after = follow[4] or follow[0]
+                    before, after = after, follow[4] or follow[0]
                 if after == lane:
-                    return tuple(reversed(way))
-        return ()
+                    return before
+        return None
 
 
 def box_of(sight: Mapping[int, Any], size_m: tuple[float, float], origin_m: tuple[float, float]) -> Box:

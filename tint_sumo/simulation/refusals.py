@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from tint_sumo.core.errors import InputError
-from tint_sumo.scenes.sumo_config import SumoConfig
+from tint_sumo.scenes.sumo_config import SumoConfig, refused
 from tint_sumo.simulation.connection import SUMO_ERRORS
 
 
@@ -21,6 +20,9 @@ class Refusals:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         if isinstance(error, SUMO_ERRORS):
-            reason = " ".join(str(error).split())
-            file = self.config.file
-            raise InputError(f"SUMO does not run {file} ({reason}); try it with: sumo -c {file}") from None
+            raise refused(f"does not run {self.config.file} ({one_line(error)})", self.config.file) from None
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error of SUMO, whose lines are joined."""
+    return " ".join(str(error).split())

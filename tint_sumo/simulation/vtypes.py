@@ -14,6 +14,7 @@ from tint_sumo.core.files import shipped
 from tint_sumo.core.reading import TABLE_BYTES, require_file
 from tint_sumo.scenes.sumo_config import base_vtype, read_config
 from tint_sumo.simulation.connection import SUMO_ERRORS, connect
+from tint_sumo.simulation.refusals import one_line
 
 _ATTRIBUTES = ("id", "vClass", "length", "width")  # of a vType: its size follows from them
 _MODEL, _USUAL_MODEL = "carFollowModel", "Krauss"  # SUMO does not say which model a type has
@@ -50,7 +51,7 @@ def read_vtype_table(file: Path) -> Mapping[str, VType]:
         try:
             connection = connect([*options, "--no-step-log", "true", "--no-warnings", "true"])
         except SUMO_ERRORS as error:
-            raise InputError(f"SUMO refuses a vType of {file} ({' '.join(str(error).split())}); correct it") from None
+            raise InputError(f"SUMO refuses a vType of {file} ({one_line(error)}); correct it") from None
         try:
             types = connection.vehicletype
             return {

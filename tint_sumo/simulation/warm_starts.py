@@ -9,8 +9,7 @@ with persons, parking areas and calibrators SUMO 1.28 can end with a segmentatio
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.sumo_run import SumocfgRun
 from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation.connection import LOAD_STATE, SUMO_ERRORS, Connection
+from tint_sumo.simulation.refusals import one_line
 
 _CHOICE, _STATE = 2, 3  # what is drawn from a seed: the number of a state; and from the number of a state: its traffic
 _SAME_M = 0.01  # vehicles and persons of a loaded state are at most so far from where they were
@@ -84,8 +84,13 @@ class WarmStarts:
         self.connection.step(self.connection.simulation.getTime() + self.scene.warm_up_s)
 
     def _load_state(self, seed: int | Sequence[int], file: Path) -> None:
-        with _refusals(self.scene):
+        try:
             self.connection.load(self.run.options(seed, more={LOAD_STATE: str(file), **_LOADING}))
+        except SUMO_ERRORS as error:
+            raise InputError(
+                f"SUMO does not load a state of {self.scene.config.file} that it has saved itself "
+                f"({one_line(error)}); set warm_starts to 0"
+            ) from None
 
     def _positions(self) -> _Positions:
         return {
@@ -99,15 +104,3 @@ def _are_same(saved: _Positions, loaded: _Positions) -> bool:
     return saved.keys() == loaded.keys() and all(
         math.dist(position_m, loaded[name]) < _SAME_M for name, position_m in saved.items()
     )
-
-
-@contextmanager
-def _refusals(scene: SumocfgScene) -> Iterator[None]:
-    try:
-        yield
-    except SUMO_ERRORS as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"SUMO does not load a state of {scene.config.file} that it has saved itself ({reason}); "
-            "set warm_starts to 0"
-        ) from None

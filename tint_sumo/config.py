@@ -149,6 +149,7 @@ class Towns:
     count: Annotated[int, Range(1, MOST_VTYPES)] = 128
     seed: TrafficSeed = 2022  # seed of the draws; another one gives other towns
     only: Annotated[int, Range(0, MOST_VTYPES - 1)] | None = None  # all episodes are in the town of this number, from 0
+    episodes: Annotated[int, Range(1, 1_000_000)] = 1  # so many episodes of an environment in a row are in one town
     tau_s: tuple[TauS, TauS] = (0.6, 1.8)
     desired_speed_mps: tuple[DriverSpeedMps, DriverSpeedMps] = (2.3, 3.1)
     accel_mps2: tuple[AccelMps2, AccelMps2] = (2.0, 4.0)
@@ -224,6 +225,11 @@ class Population:
         if vtypes > MOST_VTYPES:
             times = "members times the weights of profiles" + ("" if self.towns is None else " times towns")
             raise InputError(f"{times} must be {MOST_VTYPES:,} at most, not {vtypes:,}")
+
+    @property
+    def episodes_per_town(self) -> int:
+        """Number of episodes in a row that are in one town."""
+        return 1 if self.towns is None else self.towns.episodes
 
     @property
     def least_tau_s(self) -> float:

@@ -115,9 +115,9 @@ def played(index: int, num_envs: int, rng: np.random.Generator, **settings: Any)
     with episodes(num_envs, **settings) as batch:
         for other in range(num_envs):
             if other != index:
-                batch.begin(other, np.random.default_rng([other, 99]))
+                batch.begin(other, episode_seed(np.random.default_rng([other, 99])))
         for _ in range(2):
-            batch.begin(index, rng)
+            batch.begin(index, episode_seed(rng))
             found.append(batch.rows[index].tolist())
             for _ in range(8):
                 batch.step(np.full(num_envs, GO))
@@ -137,7 +137,7 @@ def test_noise_is_drawn_anew_in_every_step_and_episode() -> None:
         drawn = []
         for seed in (1, 2):
             for batch in (noisy, clear):
-                batch.begin(0, np.random.default_rng(seed))
+                batch.begin(0, episode_seed(np.random.default_rng(seed)))
             for _ in range(3):
                 noise = (noisy.rows["vehicles"] - clear.rows["vehicles"])[0]
                 drawn.append(noise[0].tolist())
@@ -153,7 +153,7 @@ def test_noise_is_drawn_anew_in_every_step_and_episode() -> None:
 def test_empty_slots_have_no_trait_and_others_the_number_of_their_profile() -> None:
     scene = replace(T, population=Population(tuple(reversed(T.population.profiles))), traffic=Traffic(Mix(1.0)))
     with episodes(1, scene=scene) as batch:
-        batch.begin(0, np.random.default_rng(0))
+        batch.begin(0, episode_seed(np.random.default_rng(0)))
         row = batch.rows[0]
         assert set(row["traits"][row["mask"] == 1.0].tolist()) == {1}  # the second profile is the conservative one
         assert set(row["traits"][row["mask"] == 0.0].tolist()) == {NO_VEHICLE} == {-1}
@@ -162,7 +162,7 @@ def test_empty_slots_have_no_trait_and_others_the_number_of_their_profile() -> N
 def test_actions_are_numbers_of_desired_speeds() -> None:
     with episodes(2) as batch:
         for index in range(2):
-            batch.begin(index, np.random.default_rng(index))
+            batch.begin(index, episode_seed(np.random.default_rng(index)))
         for _ in range(12):
             batch.step(np.array([1, GO]))
         assert batch.simulation.egos.speed_mps == pytest.approx([0.5, 2.7], abs=0.1)
@@ -171,9 +171,9 @@ def test_actions_are_numbers_of_desired_speeds() -> None:
 
 def test_a_decision_ends_with_its_episode() -> None:
     with episodes(2, decision_s=0.5, time_limit_s=0.7) as batch:
-        batch.begin(0, np.random.default_rng(0))
+        batch.begin(0, episode_seed(np.random.default_rng(0)))
         assert not batch.step(np.array([GO, GO]))
-        batch.begin(1, np.random.default_rng(1))
+        batch.begin(1, episode_seed(np.random.default_rng(1)))
         assert batch.step(np.array([GO, GO]))
         assert batch.rows["time_s"] == pytest.approx([0.7, 0.5])
         assert batch.rows["truncated"].tolist() == [True, False]
@@ -183,13 +183,13 @@ def test_a_decision_ends_with_its_episode() -> None:
 def test_a_parked_environment_stands_until_its_next_episode() -> None:
     with episodes(2, time_limit_s=0.3) as batch:
         for index in range(2):
-            batch.begin(index, np.random.default_rng(index))
+            batch.begin(index, episode_seed(np.random.default_rng(index)))
         batch.park(1)
         for _ in range(5):
             batch.step(np.array([GO, GO]))
         assert batch.steps.tolist() == [5, 0] and not batch.rows["mask"][1].any()
         assert batch.simulation.egos.speed_mps[1] == 0.0 and batch.rows["outcome"][1] == 0
-        batch.begin(1, np.random.default_rng(1))
+        batch.begin(1, episode_seed(np.random.default_rng(1)))
         batch.step(np.array([GO, GO]))
         assert batch.steps.tolist() == [6, 1] and batch.simulation.egos.speed_mps[1] > 0.0
 
@@ -197,7 +197,7 @@ def test_a_parked_environment_stands_until_its_next_episode() -> None:
 def test_an_episode_that_ended_with_a_collision_has_its_details() -> None:
     with episodes(1, p_conservative=0.0) as batch:
         for seed in range(9):
-            batch.begin(0, np.random.default_rng(seed))
+            batch.begin(0, episode_seed(np.random.default_rng(seed)))
             assert batch.collision_info(0) == {}
             while not batch.step(np.array([GO])):
                 assert batch.collision_info(0) == {}

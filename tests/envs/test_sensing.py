@@ -12,7 +12,7 @@ import pytest
 from tint_sumo.config import PERFECT, SENSORS, Sensor
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
-from tint_sumo.envs.episodes import Episodes
+from tint_sumo.envs.episodes import Episodes, episode_seed
 from tint_sumo.envs.rendering import pale
 from tint_sumo.envs.rows import SEEN, TRACKS
 from tint_sumo.envs.sensing import Memory, follow_dropouts, follow_noise, show_seen
@@ -102,7 +102,7 @@ def test_white_noise_is_drawn_step_by_step_from_the_second_stream_of_the_episode
         rngs = [np.random.default_rng(index) for index in (4, 5)]
         seeds = [int(np.random.default_rng(index).integers(2**63)) for index in (4, 5)]
         for index, rng in enumerate(rngs):
-            batch.begin(index, rng)
+            batch.begin(index, episode_seed(rng))
         drawn = [np.random.default_rng([seed, 1]) for seed in seeds]
         for _ in range(40):
             for index, rng in enumerate(drawn):
@@ -113,7 +113,7 @@ def test_white_noise_is_drawn_step_by_step_from_the_second_stream_of_the_episode
 def test_a_perfect_sensor_shows_all_vehicles_in_their_slots() -> None:
     with episodes(2, PERFECT) as batch:
         for index in range(2):
-            batch.begin(index, np.random.default_rng(index))
+            batch.begin(index, episode_seed(np.random.default_rng(index)))
         for _ in range(30):
             slots, rows = batch.simulation.slots, batch.rows
             np.testing.assert_array_equal(rows["mask"], slots.present)
@@ -194,7 +194,7 @@ def test_a_delayed_sensor_shows_what_was_seen_so_many_steps_before() -> None:
         for _ in range(2):  # a second episode begins in one of them
             for batch in (direct, delayed):
                 for index in range(2 - len(history) // 30):
-                    batch.begin(index, np.random.default_rng([index, len(history)]))
+                    batch.begin(index, episode_seed(np.random.default_rng([index, len(history)])))
             begun = len(history) - 1
             for step in range(30):
                 history.append([direct.rows[field].copy() for field in SEEN])
@@ -229,7 +229,7 @@ def test_all_that_is_observed_is_of_vehicles_that_are_seen(sensor: Sensor) -> No
     with episodes(3, sensor, p_conservative=(0.1, 0.9)) as batch:
         simulation, sensing = batch.simulation, batch.sensing
         for index in range(3):
-            batch.begin(index, np.random.default_rng(index))
+            batch.begin(index, episode_seed(np.random.default_rng(index)))
         numbers: dict[tuple[int, int], int] = {}
         for _ in range(120):
             slots, rows = simulation.slots, batch.rows

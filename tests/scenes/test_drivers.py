@@ -144,6 +144,25 @@ def test_an_episode_draws_from_the_drivers_of_one_town_whatever_the_batch() -> N
     assert len(set(towns)) > 10
 
 
+@pytest.mark.parametrize("seeds", [range(30, 60), [[7, number] for number in range(30, 60)]])
+def test_episodes_of_a_row_of_seeds_are_in_one_town_and_differ(seeds: Any) -> None:
+    rows_of_5, alone = (replace(MANY, towns=replace(TOWNS, count=20, episodes=episodes)) for episodes in (5, 1))
+    demands = []
+    for population in (rows_of_5, alone):
+        scene = replace(find_scene(T_INTERSECTION), population=population)
+        demands.append(Demand(1, members(population), layout(scene)))
+    towns, placed = [], []
+    for seed in seeds:
+        first, other = (demand.begin(0, np.random.SeedSequence(seed)) for demand in demands)
+        towns.append(int(demands[0].town[0]))
+        placed.append(first)
+        is_first = (seed if isinstance(seed, int) else seed[-1]) % 5 == 0
+        assert not is_first or first == other, "the first episode of a row is as without rows"
+    rows = np.array(towns).reshape(-1, 5)
+    assert (rows == rows[:, :1]).all() and len(set(rows[:, 0].tolist())) > 3
+    assert len({tuple(one) for one in placed}) == len(placed)
+
+
 def test_there_is_a_distribution_for_each_town_and_plain_sumo_drives_the_first_one() -> None:
     for only, numbers in ((None, (0, 1, 2)), (2, (2,))):
         xml = vtypes_xml(replace(MANY, towns=replace(TOWNS, count=3, only=only)), 0.4, VehicleShape())

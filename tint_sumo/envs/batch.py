@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from tint_sumo.core.errors import InputError, shown
-from tint_sumo.envs.episodes import Episodes, TaskSettings
+from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings
 from tint_sumo.envs.rows import Rows, outcome_name
 from tint_sumo.simulation.timing import StepPart, does
 
@@ -35,9 +35,10 @@ class Ended:
 class Snapshot:
     """Generator state and actions that replay an episode to this step."""
 
-    began: dict[str, Any]  # state of the environment's generator when the episode's seed was drawn
+    began: dict[str, Any]  # see ``tint_sumo.envs.episodes.EpisodeStart``
     actions: tuple[int, ...]
     task: str  # fingerprint of the environment's settings
+    number: int = 0  # of the episode in its row
 
 
 def checked_snapshots(snapshots: Any, tasks: Sequence[str]) -> list[Snapshot]:
@@ -95,7 +96,7 @@ class LocalBatch:
         self.episodes = Episodes(num_envs, settings, rows)
         self.rows = self.episodes.rows
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
-        self._began: list[dict[str, Any]] = [{}] * num_envs  # states of the generators when the episodes began
+        self._starts: list[EpisodeStart | None] = [None] * num_envs  # of the present episodes
         self._settings = settings
         # The actions of the last decisions, (N,) each.
         self._actions: deque[NDArray[np.integer]] = deque(maxlen=settings.decisions_per_episode + 1)
@@ -105,12 +106,15 @@ class LocalBatch:
             self._begin(index, seeds[index])
 
     def _begin(self, index: int, seed: int | None = None) -> None:
-        rng = self._rngs[index]
+        rng, before = self._rngs[index], self._starts[index]
         if rng is None or seed is not None:
             rng, _ = seeding.np_random(seed)
-            self._rngs[index] = rng
-        self._began[index] = dict(rng.bit_generator.state)
-        self.episodes.begin(index, rng)
+            self._rngs[index], before = rng, None
+        self._start(index, EpisodeStart.after(before, rng, self._settings.episodes_per_town))
+
+    def _start(self, index: int, start: EpisodeStart) -> None:
+        self._starts[index] = start
+        self.episodes.begin(index, start.seed)
 
     @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> list[Ended]:
@@ -137,13 +141,14 @@ class LocalBatch:
             self.episodes.park(index)
 
     def snapshot(self) -> list[Snapshot]:
-        taken = np.array(self._actions, _ACTION).reshape(-1, len(self._began))
+        taken = np.array(self._actions, _ACTION).reshape(-1, len(self._starts))
         # The last decision may have been cut short.
         decisions = -(-self.episodes.steps // self._settings.steps_per_decision)
         first = len(taken) - decisions  # of the present episodes
         return [
-            Snapshot(began, tuple(taken[first[index] :, index].tolist()), self._settings.fingerprint)
-            for index, began in enumerate(self._began)
+            Snapshot(start.began, tuple(actions[begin:].tolist()), self._settings.fingerprint, start.number)
+            for start, actions, begin in zip(self._starts, taken.T, first.tolist(), strict=True)
+            if start is not None  # as none is: all have been reset
         ]
 
     def restore(self, snapshots: Sequence[Snapshot]) -> None:
@@ -155,7 +160,7 @@ class LocalBatch:
                     rng, _ = seeding.np_random(0)
                     rng.bit_generator.state = snapshot.began
                     self._rngs[index] = rng
-                    self._begin(index)
+                    self._start(index, EpisodeStart.drawn(rng, self._settings.episodes_per_town, snapshot.number))
             if left:
                 actions = [snapshot.actions[-left] if left <= len(snapshot.actions) else 0 for snapshot in snapshots]
                 self._actions.append(np.array(actions, _ACTION))

@@ -42,7 +42,7 @@ from tint_sumo.envs.rows import (
     row_type,
 )
 from tint_sumo.envs.sensing import Sensing
-from tint_sumo.scenes import AnyScene, find_scene, paper_scene, require_built_in
+from tint_sumo.scenes import AnyScene, Scene, find_scene, paper_scene, require_built_in
 from tint_sumo.scenes.buildings import corner_buildings
 from tint_sumo.scenes.geometry import NO_VEHICLE, Floats
 from tint_sumo.simulation import make_simulation
@@ -127,6 +127,12 @@ class TaskSettings:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
+    def episodes_per_town(self) -> int:
+        """Number of episodes in a row that are in one town."""
+        scene = self.scene
+        return scene.population.episodes_per_town if isinstance(scene, Scene) else 1
+
+    @property
     def slot_infos(self) -> tuple[str, ...]:
         """Fields of the infos that have a value for each vehicle slot."""
         truth = () if self.sensor == PERFECT else TRUTH
@@ -173,9 +179,36 @@ def observation_space(max_vehicles: int) -> spaces.Dict:
     )
 
 
-def episode_seed(rng: np.random.Generator) -> int:
-    """Return the seed of the next episode of an environment with this generator."""
-    return int(rng.integers(_SEED_LIMIT))
+def episode_seed(rng: np.random.Generator, row: int = 1) -> int:
+    """Return the seed of the next episode of an environment with this generator, where a row of episodes begins.
+
+    Args:
+        rng: the generator.
+        row: number of episodes in a row that are in one town; the seed is a multiple of it, and the others follow.
+    """
+    return int(rng.integers(_SEED_LIMIT)) // row * row
+
+
+@dataclass(frozen=True)
+class EpisodeStart:
+    """The start of an environment's episode: its seed, and what it follows from."""
+
+    began: dict[str, Any]  # state of the environment's generator before it drew the seed of the row's first episode
+    seed: int
+    number: int = 0  # of the episode in its row, all of which are in one town
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, row: int, number: int = 0) -> "EpisodeStart":
+        """Return the episode of this number in the next row of the generator."""
+        began = dict(rng.bit_generator.state)
+        return cls(began, episode_seed(rng, row) + number, number)
+
+    @classmethod
+    def after(cls, before: "EpisodeStart | None", rng: np.random.Generator, row: int) -> "EpisodeStart":
+        """Return the episode that follows, in the same row or at the beginning of the next one."""
+        if before is None or before.number + 1 == row:
+            return cls.drawn(rng, row)
+        return replace(before, seed=before.seed + 1, number=before.number + 1)
 
 
 class Episodes:
@@ -201,13 +234,11 @@ class Episodes:
         self._reveals = settings.sensor != PERFECT
         self.sensing = Sensing(settings.sensor, self.simulation, scene.step_s)
 
-    def begin(self, index: int, rng: np.random.Generator) -> None:
-        """Start a new episode, whose seed is drawn from an environment's generator."""
-        seed = episode_seed(rng)
+    def begin(self, index: int, seed: int) -> None:
+        """Start a new episode in an environment."""
         self.simulation.reset(index, seed)
         self._parked.discard(index)
-        self.rows[index] = np.zeros((), self.rows.dtype)
-        self.steps[index] = 0
+        self._clear(index)
         self.sensing.begin(index, seed)
         self._observe(slice(index, index + 1))
 
@@ -215,9 +246,13 @@ class Episodes:
         """Empty an environment, whose ego stands and whose time does not pass until its next episode begins."""
         self.simulation.clear(index)
         self._parked.add(index)
-        self.rows[index] = np.zeros((), self.rows.dtype)
-        self.steps[index] = 0
+        self._clear(index)
         self._observe(slice(index, index + 1))
+
+    def _clear(self, index: int) -> None:
+        self.rows[index] = np.zeros((), self.rows.dtype)
+        self.rows["town"][index] = self.simulation.town[index]
+        self.steps[index] = 0
 
     @does(StepPart.OTHER)
     def step(self, actions: NDArray[np.integer]) -> bool:

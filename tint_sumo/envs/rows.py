@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import SPEED_SCALE_MPS, STEP_S, RewardPreset
 from tint_sumo.core.compiling import compiled
+from tint_sumo.scenes.drivers import NO_TOWN
 from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.scene import Scene
 from tint_sumo.scenes.sumocfg import SumocfgScene
@@ -46,6 +47,7 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
             ("true_mask", np.int8, slots),  # of the simulation's slots, as they are: 1 where there is a vehicle
             ("true_vehicles", np.float32, (max_vehicles, 2)),
             ("true_traits", np.int16, slots),
+            ("town", np.int64),  # number of the episode's town, or NO_TOWN
             ("time_s", np.float64),
             ("outcome", np.int64),
             ("terminated", np.bool_),
@@ -89,7 +91,17 @@ def observation_of(fields: Mapping[str, NDArray[Any]]) -> Observation:
 def start_info(fields: Mapping[str, Any], slot_infos: Sequence[str]) -> dict[str, Any]:
     """Return the info of an environment after a reset; ``slot_infos`` are the fields per vehicle slot that it holds."""
     slots = {key: fields[key].copy() for key in slot_infos}
-    return {**slots, "outcome": outcome_name(fields["outcome"]), "time_s": fields["time_s"]}
+    return {
+        **slots,
+        "outcome": outcome_name(fields["outcome"]),
+        "time_s": fields["time_s"],
+        **town_info(fields["town"]),
+    }
+
+
+def town_info(town: int) -> dict[str, int]:
+    """Return the town of an episode as infos hold it: only where there are towns."""
+    return {} if town == NO_TOWN else {"town": town}
 
 
 def step_info(fields: Mapping[str, Any], slot_infos: Sequence[str], collision: dict[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.calls import checked_seed
 from tint_sumo.envs.episodes import TaskSettings
-from tint_sumo.envs.rows import end_info, fields_of, observation_of
+from tint_sumo.envs.rows import end_info, fields_of, observation_of, town_info
 from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.simulation.timing import StepPart, does
 
@@ -21,7 +21,8 @@ class SceneVecEnv(VecEnv):
     """Stable-Baselines3 ``VecEnv`` of ``num_envs`` replicas of a scene in one simulation.
 
     ``settings`` and ``workers`` are as in ``SceneVectorEnv``.
-    ``infos[i]`` holds ``traits``, the true traits that go with the returned observation; when an episode ends also
+    ``infos[i]`` holds ``traits``, the true traits that go with the returned observation, and with towns ``town``, the
+    number of the town of the episode that made the step; when an episode ends also
     ``terminal_observation``, ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``is_success``, ``time_s`` and,
     after a collision, ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then; without
     ``autoreset`` it has not, and the environment shows the end of its episode until it is parked or all are reset.
@@ -57,7 +58,7 @@ class SceneVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self._keep_slots(infos)
-        self.reset_infos = [{"traits": traits} for traits in infos["traits"]]
+        self.reset_infos = _listed(infos["traits"], self.env.batch.rows["town"])
         return observation
 
     def step_async(self, actions: NDArray[np.int64]) -> None:
@@ -67,7 +68,7 @@ class SceneVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         rows, ended = self.env.advance(self._actions)
         self._keep_slots(rows)
-        listed: list[dict[str, Any]] = [{"traits": traits, "outcome": ""} for traits in rows["traits"]]
+        listed = _listed(rows["traits"], rows["town"])
         for end in ended:
             last = fields_of(end.row)
             listed[end.index] |= {
@@ -76,6 +77,7 @@ class SceneVecEnv(VecEnv):
                 "terminal_slots": {key: last[key] for key in self.env.slot_infos},
                 "outcome": end.outcome,
                 "time_s": last["time_s"],
+                **town_info(last["town"]),
                 **end_info(end.outcome, end.collision),
             }
         done = rows["terminated"] | rows["truncated"]
@@ -126,3 +128,8 @@ class SceneVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         return self.env.render() or [None] * self.num_envs
+
+
+def _listed(traits: NDArray[np.int16], towns: NDArray[np.int64]) -> list[dict[str, Any]]:
+    """Return an info for each environment: the true traits (N, V), and the town (N,) of those that have one."""
+    return [{"traits": one, "outcome": "", **town_info(town)} for one, town in zip(traits, towns.tolist(), strict=True)]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Snapshot, checked_snapshots
 from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_options, checked_seed
-from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, observation_space
+from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings, action_space, observation_space
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
 from tint_sumo.envs.rows import OBSERVATION_KEYS, Observation, fields_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
@@ -85,6 +85,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `outcome`      | `"success"`, `"collision"`, `"timeout"`, `"lost"`, or `""` while the episode goes on        |
     | `reward_terms` | the reward's named terms (after a step)                                                     |
     | `time_s`       | time since the episode's start                                                              |
+    | `town`         | in a population with towns: number of the episode's town                                    |
     | `is_success`   | at the episode's end: whether the outcome is `"success"`                                    |
     | `collision`    | after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`; for a person   |
     |                | on foot in a SUMO configuration, `trait` is `"pedestrian"` and `slot` is -1                 |
@@ -159,7 +160,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._settings = settings
         self._calls = Calls()
         self._episodes = Episodes(1, settings)
-        self._began: dict[str, Any] = {}
+        self._start: EpisodeStart | None = None  # of the present episode
         self._actions: list[int] = []
 
     @property
@@ -183,7 +184,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._calls.require_open()
         checked_options(options)
         super().reset(seed=checked_seed(seed))
-        self._play(())
+        before = self._start if seed is None else None
+        self._play(EpisodeStart.after(before, self.np_random, self._settings.episodes_per_town), ())
         self._show()
         return self._shown()
 
@@ -199,14 +201,13 @@ class SceneEnv(gymnasium.Env[Any, Any]):
             self._episodes.simulation.close()
             del self._episodes
 
-    def _play(self, actions: Sequence[int]) -> None:
-        """Begin an episode drawn from the generator, and take these actions in it."""
+    def _play(self, start: EpisodeStart, actions: Sequence[int]) -> None:
+        """Begin an episode, and take these actions in it."""
         if self._calls.phase is Phase.BUSY:  # an interrupted call may have been done in part
             self._stop()
         with self._calls:
-            self._began = dict(self.np_random.bit_generator.state)
-            self._actions = []
-            self._episodes.begin(0, self.np_random)
+            self._start, self._actions = start, []
+            self._episodes.begin(0, start.seed)
             for action in actions:
                 self._step(np.array([action]))
 
@@ -236,7 +237,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
             InputError: no episode has begun.
         """
         self._calls.require_episode()
-        return Snapshot(self._began, tuple(self._actions), self._settings.fingerprint)
+        start = self._start
+        assert start is not None
+        return Snapshot(start.began, tuple(self._actions), self._settings.fingerprint, start.number)
 
     def restore(self, snapshot: Snapshot) -> tuple[Observation, dict[str, Any]]:
         """Replay an episode of this environment, or of one with the same arguments; return observation and info there.
@@ -250,7 +253,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._calls.require_open()
         (snapshot,) = checked_snapshots([snapshot], [self._settings.fingerprint])
         self.np_random.bit_generator.state = snapshot.began
-        self._play(snapshot.actions)
+        row = self._settings.episodes_per_town
+        self._play(EpisodeStart.drawn(self.np_random, row, snapshot.number), snapshot.actions)
         self._show()
         return self._shown()
 

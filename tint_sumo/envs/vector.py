@@ -37,6 +37,7 @@ from tint_sumo.envs.rows import (
     step_info,
 )
 from tint_sumo.envs.workers import WorkerBatch, shares_of
+from tint_sumo.scenes.drivers import NO_TOWN
 
 MOST_ENVS = 100_000  # environments of one vector; memory would not do for more
 
@@ -226,11 +227,13 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         """Return the infos of the environments in a mask, or of all; 0 or None elsewhere, as gymnasium has it."""
         infos = {**{key: rows[key] for key in self.slot_infos}, "outcome": outcome_names(rows["outcome"])}
         infos["time_s"] = rows["time_s"]
-        if mask is None:
-            return _masked(infos, np.ones(self.num_envs, bool))
-        for values in infos.values():
-            values[~mask] = None if values.dtype == object else 0
-        return _masked(infos, mask.copy())
+        shown = np.ones(self.num_envs, bool) if mask is None else mask.copy()
+        if not shown.all():
+            for values in infos.values():
+                values[~shown] = None if values.dtype == object else 0
+        in_town = shown & (rows["town"] != NO_TOWN)
+        towns = _masked({"town": np.where(in_town, rows["town"], 0)}, in_town) if in_town.any() else {}
+        return {**_masked(infos, shown), **towns}
 
     def _ending(self, ended: Ended) -> dict[str, Any]:
         """Return the entries that infos get where an episode has ended."""

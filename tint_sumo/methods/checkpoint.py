@@ -72,7 +72,8 @@ class _State:
     recent: tuple[str, ...]  # outcomes of the last episodes
     infos: tuple[_EpisodeInfo, ...]  # of the last episodes
     successes: tuple[bool, ...]  # of the last episodes
-    began: tuple[_Pcg64, ...]  # the environments' generators when their present episodes began
+    began: tuple[_Pcg64, ...]  # see ``tint_sumo.envs.batch.Snapshot``
+    numbers: tuple[_Count, ...] | None = None  # of the present episodes in their rows; None: each is the first one
 
 
 def make_checkpoint(model: RecurrentPPO, recent: Iterable[str]) -> bytes:
@@ -100,6 +101,7 @@ def make_checkpoint(model: RecurrentPPO, recent: Iterable[str]) -> bytes:
         tuple(_EpisodeInfo(float(info["r"]), int(info["l"]), float(info["t"])) for info in model.ep_info_buffer),
         tuple(bool(success) for success in model.ep_success_buffer),
         tuple(_Pcg64.of(episode.began) for episode in there.episodes),
+        tuple(episode.number for episode in there.episodes),
     )
     return pack(tensors, state)
 
@@ -166,12 +168,13 @@ def _episodes(venv: VecEnv, tensors: Tensors, state: _State) -> list[Snapshot]:
     """Return the snapshots of the environments."""
     assert isinstance(venv.action_space, spaces.Discrete)
     counts, actions = tensors[_COUNTS].tolist(), tensors[_ACTIONS].tolist()
-    if not len(counts) == len(state.began) == venv.num_envs:
+    numbers = state.numbers or (0,) * len(counts)
+    if not len(counts) == len(state.began) == len(numbers) == venv.num_envs:
         raise ValueError(f"it is of {len(counts)} environments, not of {venv.num_envs}")
     if min(counts) < 0 or sum(counts) != len(actions) or not set(actions) <= set(range(int(venv.action_space.n))):
         raise ValueError("the actions of its episodes do not fit")
     ends, (tasks,) = np.cumsum(counts).tolist(), venv.get_attr("tasks", 0)
     return [
-        Snapshot(began.to_numpy(), tuple(actions[end - count : end]), task)
-        for began, count, end, task in zip(state.began, counts, ends, tasks, strict=True)
+        Snapshot(began.to_numpy(), tuple(actions[end - count : end]), task, number)
+        for began, count, end, task, number in zip(state.began, counts, ends, tasks, numbers, strict=True)
     ]

@@ -2,12 +2,13 @@
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Annotated, Any
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from tint_sumo.config import MOST_VTYPES
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.core.ranges import Range
@@ -33,9 +34,19 @@ class Case:
     time_s: float  # time of its end
     trait: str | None = None  # trait of the driver that was hit
     route: str | None = None  # route of that driver
+    town: int | None = None  # number of the episode's town
+
+    def stored(self) -> tuple[Any, ...]:
+        """Return the case as files hold it: with its town only if there are towns."""
+        values = astuple(self)
+        return values[:-1] if self.town is None else values
 
 
-StoredCase = tuple[Outcome, Annotated[float, Range(0.0, 1e6)], str | None, str | None]  # a case in files
+_Time = Annotated[float, Range(0.0, 1e6)]
+_Town = Annotated[int, Range(0, MOST_VTYPES)]
+StoredCase = (
+    tuple[Outcome, _Time, str | None, str | None] | tuple[Outcome, _Time, str | None, str | None, _Town]
+)  # a case in files
 
 
 @dataclass(frozen=True)
@@ -155,4 +166,4 @@ def _shares(cases: Collection[Case]) -> dict[str, float]:
 
 def _case(info: dict[str, Any]) -> Case:
     hit = info.get("collision", {})
-    return Case(info["outcome"], round(info["time_s"], 3), hit.get("trait"), hit.get("route"))
+    return Case(info["outcome"], round(info["time_s"], 3), hit.get("trait"), hit.get("route"), info.get("town"))

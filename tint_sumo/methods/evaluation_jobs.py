@@ -3,7 +3,7 @@
 import math
 import shutil
 import tempfile
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -74,7 +74,7 @@ class CasesJob:
             first=self.first,
             report=report,
         )
-        write_json(self.file, {"cases": [astuple(case) for case in evaluation.cases]})
+        write_json(self.file, {"cases": [case.stored() for case in evaluation.cases]})
         return ""
 
     def cases(self) -> tuple[Case, ...]:

@@ -26,6 +26,7 @@ from tint_sumo.core.structures import FieldError, ReadBy, Where, build, choose
 
 DISTRIBUTION_ID = "drivers"
 EGO_TYPE = "ego"
+NO_TOWN = -1  # number of the town of drivers and episodes in a population without towns
 
 
 def read_population(value: Any, where: Where = ()) -> Population:
@@ -83,7 +84,7 @@ class DriverMember:
     min_gap_m: float
     idm: Idm
     entry_gap_m: tuple[float, float]
-    town: int = 0
+    town: int = NO_TOWN
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from tint_sumo.config import (
     Slots,
     StepS,
     TimeS,
+    Towns,
     VehicleShape,
     WarmStarts,
     WarmUpS,
@@ -119,8 +120,9 @@ class SceneSettings:
     def _named(self) -> dict[str, Any]:
         """Return the settings from which a name is made; without what is newer it is that of earlier versions."""
         named = {name: value for name, value in plain(self).items() if name != "buildings" or value != []}
-        newer = {"towns": Population.towns, "car_following": Population.car_following}
-        drivers = {key: value for key, value in named["population"].items() if key not in newer or value != newer[key]}
+        drivers = _without(named["population"], {"towns": None, "car_following": Population.car_following})
+        if "towns" in drivers:
+            drivers["towns"] = _without(drivers["towns"], {"episodes": Towns.episodes})
         return {**named, "population": drivers}
 
 
@@ -158,6 +160,11 @@ class SumocfgSettings:
 
     def scene(self) -> SumocfgScene:
         return from_sumocfg(**{field.name: getattr(self, field.name) for field in fields(self)})
+
+
+def _without(values: Mapping[str, Any], newer: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values without those that are newer, as long as they are the defaults given."""
+    return {key: value for key, value in values.items() if key not in newer or value != newer[key]}
 
 
 def _digest(settings: Mapping[str, Any]) -> str:

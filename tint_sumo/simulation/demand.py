@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tint_sumo.core.compiling import compiled
-from tint_sumo.scenes.drivers import DriverMember
+from tint_sumo.scenes.drivers import NO_TOWN, DriverMember
 from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Floats, Numbers
 from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.slots import Slots
@@ -33,7 +33,7 @@ class Driver:
 class DriverPool:
     """The drivers that all routes' streams draw from in an episode: those of a town."""
 
-    def __init__(self, population: tuple[DriverMember, ...], layout: Layout, town: int = 0) -> None:
+    def __init__(self, population: tuple[DriverMember, ...], layout: Layout, town: int = NO_TOWN) -> None:
         self.population = population
         self.scene = layout.scene
         everybody = [index for index, member in enumerate(population) if member.town == town]
@@ -89,7 +89,7 @@ class Demand:
         shape = (replicas, len(layout.routes))
         self._layout = layout
         towns = sorted({member.town for member in population})
-        self.town: Numbers = np.full(replicas, towns[0])  # number of the town of each replica's episode
+        self.town: Numbers = np.full(replicas, towns[0])  # of each replica's episode
         self._towns, self._pools = towns, [DriverPool(population, layout, town) for town in towns]
         self._streams: list[tuple[DriverStream, ...]] = [() for _ in range(replicas)]
         self._wanted_gap_m: Floats = np.full(shape, np.inf)
@@ -104,9 +104,8 @@ class Demand:
 
     def begin(self, replica: int, seed: np.random.SeedSequence) -> list[PlacedVehicle]:
         """Start an episode; return the vehicles that are on the roads already."""
-        mix, rng = self._layout.scene.traffic.p_conservative, np.random.default_rng(seed)
-        p_conservative = rng.uniform(mix.low, mix.high)
-        drawn = int(rng.integers(len(self._pools)))
+        p_conservative, _ = self._draw(seed)
+        _, drawn = self._draw(first_of_row(seed, self._layout.scene.population.episodes_per_town))
         pool, self.town[replica] = self._pools[drawn], self._towns[drawn]
         streams = tuple(
             DriverStream(np.random.default_rng(child), pool, p_conservative)
@@ -121,6 +120,11 @@ class Demand:
         for route in range(len(streams)):
             self._expect(replica, route, 0.0)
         return placed
+
+    def _draw(self, seed: np.random.SeedSequence) -> tuple[float, int]:
+        """Return an episode's P(conservative), and the position of its town among the towns."""
+        mix, rng = self._layout.scene.traffic.p_conservative, np.random.default_rng(seed)
+        return rng.uniform(mix.low, mix.high), int(rng.integers(len(self._pools)))
 
     def stop(self, replica: int) -> None:
         """Let no driver appear any more."""
@@ -163,6 +167,21 @@ class Demand:
         upcoming = self._streams[replica][route].upcoming
         self._wanted_gap_m[replica, route] = upcoming.gap_m
         self._wanted_time_s[replica, route] = time_s + upcoming.wait_s
+
+
+def first_of_row(seed: np.random.SeedSequence, episodes: int) -> np.random.SeedSequence:
+    """Return the seed of the first episode of a row of ``episodes`` in one town.
+
+    The seeds of a row are whole numbers one after the other, from a multiple of ``episodes`` on. A seed of several
+    numbers is counted by its last one.
+    """
+    entropy = seed.entropy
+    if isinstance(entropy, int | np.integer):
+        first: int | list[int] = int(entropy) // episodes * episodes
+    else:
+        *others, last = entropy or [0]
+        first = [*others, int(last) // episodes * episodes]
+    return np.random.SeedSequence(first, spawn_key=seed.spawn_key)
 
 
 @compiled

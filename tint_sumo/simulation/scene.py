@@ -65,7 +65,6 @@ class SceneSimulation(Simulation):
 
     @property
     def town(self) -> Numbers:
-        """Number (R,) of the town of each episode, for ``tint_sumo.scenes.drivers.draw_town``; 0 without towns."""
         return self._demand.town
 
     def view(self, replica: int) -> View:  # noqa: ARG002 - the same for all

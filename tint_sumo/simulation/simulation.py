@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from tint_sumo.scenes.drivers import NO_TOWN
 from tint_sumo.scenes.geometry import BOX, Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import Building, Scene, View
@@ -57,6 +58,11 @@ class Simulation(ABC):
     @abstractmethod
     def view(self, replica: int) -> View:
         """Return the part of the scene that pictures of a replica show."""
+
+    @property
+    def town(self) -> Numbers:
+        """Number (R,) of the town of each episode, for ``tint_sumo.scenes.drivers.draw_town``; or ``NO_TOWN``."""
+        return np.full(self.replicas, NO_TOWN)
 
     @property
     def bodies(self) -> Mapping[int, Boxes]:

@@ -34,7 +34,7 @@ def ceiling(p_conservative: Mix, episodes: int, case_set: int = 0, scene: Scene 
             count = min(simulation.replicas, episodes - first)
             for replica in range(count):
                 rng, _ = seeding.np_random(case_seed(case_set, first + replica))
-                simulation.reset(replica, episode_seed(rng))
+                simulation.reset(replica, episode_seed(rng, played.population.episodes_per_town))
             finished += int(_finishes(simulation)[:count].sum())
     finally:
         simulation.close()

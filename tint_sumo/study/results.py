@@ -1,7 +1,7 @@
 """Results of a study's policies, as files."""
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -49,7 +49,7 @@ class Result:
                 {
                     **plain(test.conditions.resolved(self.scene_tau_s)),
                     **test.evaluation.summary(),
-                    "cases": [astuple(case) for case in test.evaluation.cases],
+                    "cases": [case.stored() for case in test.evaluation.cases],
                 }
                 for test in self.tested
             ],

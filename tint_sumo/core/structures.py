@@ -313,8 +313,8 @@ def _members(kind: Any) -> list[Any]:
 
 
 def _has_parts(kind: Any, part: str | int) -> bool:
-    """Return whether values of a type have parts like this one, with a number or with a name."""
-    return (get_origin(kind) is tuple) is isinstance(part, int)
+    """Return whether values of a type have this part, which is a number or a name."""
+    return (get_origin(kind) is tuple) is isinstance(part, int) and _part(kind, part) is not None
 
 
 def _part(kind: Any, part: str | int) -> Any:

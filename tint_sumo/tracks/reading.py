@@ -78,9 +78,8 @@ def read_tracks(file: Path, format_name: str | None = None) -> Tracks:
         InputError: there is no such file, its format is not known or not the only one that fits, it is damaged, or
             values are missing, not finite or given twice.
     """
-    head = _head(file)
     if format_name is None:
-        fitting = [track_format for track_format in FORMATS.values() if track_format.recognises(head)]
+        fitting = formats_of(file)
         if not fitting:
             known = "; ".join(track_format.title for track_format in FORMATS.values())
             raise InputError(
@@ -94,6 +93,16 @@ def read_tracks(file: Path, format_name: str | None = None) -> Tracks:
         found = find_named("format", format_name, FORMATS)
     require_file(file, _ROLE, TABLE_BYTES)
     return build_tracks(file, found.name, found.read(file))
+
+
+def formats_of(file: Path) -> list[TrackFormat]:
+    """Return the formats that the beginning of a file fits.
+
+    Raises:
+        InputError: there is no such file, or it cannot be read.
+    """
+    head = _head(file)
+    return [track_format for track_format in FORMATS.values() if track_format.recognises(head)]
 
 
 @contextmanager

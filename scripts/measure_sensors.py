@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tint_sumo.config import ALL_MIXES, SENSORS, Mix, Sensor
 from tint_sumo.core.files import write_text
 from tint_sumo.envs import TaskSettings
-from tint_sumo.envs.rows import OUTCOMES
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.evaluation import REPORTED_SET, Evaluation, evaluate
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.rules import CREEP, GO, STOP, Observation, State, TimeToCollision
@@ -96,7 +96,7 @@ def policies() -> Iterator[dict[str, Any]]:
 
 
 def _rates(found: Evaluation) -> dict[str, str]:
-    return {f"{outcome}_percent": f"{100 * found.rate(outcome).value:.1f}" for outcome in OUTCOMES}
+    return {f"{outcome}_percent": f"{100 * found.rate(outcome).value:.1f}" for outcome in BUILT_IN_OUTCOMES}
 
 
 def write_rows(name: str, rows: Iterator[dict[str, Any]]) -> None:

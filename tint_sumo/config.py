@@ -34,6 +34,8 @@ SPEED_SCALE_MPS = 3.0  # velocities are observed divided by this: the ego's top 
 
 Backend = Literal["auto", "libsumo", "traci"]
 EgoControl = Literal["speed", "sumo"]
+RedLight = Literal["ignore", "cost", "end"]
+Perceivable = Literal["traffic_light", "speed_limit", "lane"]
 
 # Numbers that several settings have, with what is sensible; larger ones would fill the memory, or are mistakes.
 Fraction = Annotated[float, Range(0.0, 1.0)]
@@ -58,6 +60,7 @@ WindowCount = Annotated[int, Range(1, 100_000_000)]
 LatentCount = Annotated[int, Range(1, 64)]  # of a trait model
 Gain = Annotated[float, Range(0.001, 1000.0)]
 Weight = Annotated[float, Range(0.0, 1e6)]  # of a term of a loss
+Penalty = Annotated[float, Range(0.0, 1000.0)]  # taken from a reward
 LearningRate = Annotated[float, Range(1e-12, 1e6)]
 Layer = Annotated[int, Range(1, 2048)]
 Layers = Annotated[Many[Layer], Length(0, 8)]

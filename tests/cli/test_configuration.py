@@ -37,6 +37,8 @@ COMMAND_LINES = (
     "policy train --method oracle --out run --steps 10 --budget quick --scene all --zip",
     "policy train --method oracle --out run --p-conservative 0.4",
     "policy train --method no_labels --out run --sumocfg mine.sumocfg --ego-route a b --goal-m 90.5 --speeds-mps 0 5 9",
+    "policy train --method no_labels --out run --sumocfg a.sumocfg --ego-route a --goal-m 9 --perceives lane",
+    "policy evaluate --model ttc --sumocfg mine.sumocfg --ego-route a b --goal-m 90.5 --red-light cost",
     "policy evaluate --model ttc --p-conservative 0.1 0.9 --scene roundabout --tau 1.5",
     "policy evaluate --model no",
     "policy evaluate --model ttc --sensor range_15",

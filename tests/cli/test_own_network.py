@@ -27,7 +27,8 @@ def test_a_policy_is_trained_and_evaluated_in_a_configuration(
 ) -> None:
     out, file = tmp_path / "run", tmp_path / "quick.yaml"
     file.write_text(QUICK)
-    network = ("--sumocfg", merge.sumocfg, *TASK, "--warm-up-s", 1, "--warm-starts", 2)
+    road = ("--perceives", "traffic_light", "lane", "--red-light", "end")
+    network = ("--sumocfg", merge.sumocfg, *TASK, "--warm-up-s", 1, "--warm-starts", 2, *road)
     trained = run(
         capsys, *("policy", "train", "--method", "no_labels", *network, "--steps", 8, "--out", out, "--config", file)
     )
@@ -35,6 +36,10 @@ def test_a_policy_is_trained_and_evaluated_in_a_configuration(
     settings = read_policy_card(out / "policy")["scene_settings"]
     assert (settings["ego_route"], settings["warm_starts"]) == (["ramp", "out"], 2)
     assert settings["controller"]["desired_speeds_mps"] == [0.0, 3.0, 8.0]
+    assert (settings["perceives"], settings["red_light"]) == (["traffic_light", "lane"], "end")
+    blind = ("--sumocfg", merge.sumocfg, *TASK)
+    refused = refuse(capsys, "policy", "evaluate", "--model", out, "--episodes", 1, *blind)
+    assert "needs perceives of traffic_light, lane, and scene merge has nothing" in refused
     found = run(capsys, "policy", "evaluate", "--model", out, "--episodes", 1)
     assert (found["scene"], found["timeout"]) == ("merge", 1.0)
     for rule in ("always_go", "ttc"):

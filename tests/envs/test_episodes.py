@@ -18,6 +18,7 @@ from tint_sumo.envs.episodes import (
     episode_seed,
     observation_space,
 )
+from tint_sumo.envs.rows import Contents
 from tint_sumo.scenes import find_scene
 from tint_sumo.scenes.geometry import NO_VEHICLE
 
@@ -36,8 +37,8 @@ def episodes(num_envs: int, **settings: Any) -> Iterator[Episodes]:
 
 def test_without_settings_the_scene_is_as_it_is() -> None:
     assert TaskSettings().played == T == TaskSettings(scene=T).played
-    assert TaskSettings().slot_infos == ("traits",)
-    assert TaskSettings(tracks=True).slot_infos == ("traits", "position_m", "gap_m", "passed")
+    assert TaskSettings().contents == Contents()
+    assert TaskSettings(tracks=True).contents.slot_infos == ("traits", "position_m", "gap_m", "passed")
 
 
 @pytest.mark.parametrize(

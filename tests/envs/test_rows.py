@@ -15,6 +15,7 @@ from tint_sumo.envs.rows import (
     BUILT_IN_OUTCOMES,
     TRACKS,
     TRUTH,
+    Contents,
     Scales,
     TaskRules,
     add_up,
@@ -40,7 +41,13 @@ GOAL, BEYOND = 30.0, math.nextafter(30.0, math.inf)
 
 
 def judged(
-    front_m: float, collided: bool, steps: int, speed_mps: float = 2.0, *, lost: bool = False
+    front_m: float,
+    collided: bool,
+    steps: int,
+    speed_mps: float = 2.0,
+    *,
+    ran_red: bool = False,
+    lost: bool = False,
 ) -> tuple[np.ndarray, bool]:
     rows = np.zeros(1, row_type(2))
     rows["outcome"] = 3  # of an earlier episode
@@ -48,6 +55,7 @@ def judged(
         np.array([front_m]),
         np.array([speed_mps]),
         np.array([collided]),
+        np.array([ran_red]),
         np.array([lost]),
         np.array([steps]),
         RULES,
@@ -90,6 +98,16 @@ def test_an_ego_that_is_lost_has_neither_arrived_nor_run_out_of_time(steps: int)
     assert (row["goal"], row["collision"], row["step"]) == (0.0, 0.0, RULES.step)
 
 
+def test_driving_over_a_red_light_ends_an_episode_before_all_but_a_collision() -> None:
+    for front_m, steps, lost in product((GOAL, BEYOND), (1, 100), (False, True)):
+        row, ended = judged(front_m, False, steps, ran_red=True, lost=lost)
+        assert ended
+        assert outcome_name(row["outcome"]) == "red_light"
+        assert row["terminated"] and not row["truncated"]
+        assert row["reward"] == 0.0, "what it costs is a term of its own"
+    assert outcome_name(judged(GOAL, True, 1, ran_red=True)[0]["outcome"]) == "collision"
+
+
 @pytest.mark.parametrize(
     ("front_m", "collided", "steps", "terms"),
     [
@@ -110,7 +128,7 @@ def test_rows_are_judged_one_by_one() -> None:
     rows = np.zeros(len(cases), row_type(1))
     front_m, collided, steps = (np.array(part) for part in zip(*cases, strict=True))
     lost = np.zeros(len(cases), bool)
-    assert judge(front_m, np.arange(len(cases), dtype=float), collided, lost, steps, RULES, rows)
+    assert judge(front_m, np.arange(len(cases), dtype=float), collided, lost, lost, steps, RULES, rows)
     for row, case, speed_mps in zip(rows, cases, range(len(cases)), strict=True):
         alone = judged(*case, speed_mps)[0]
         assert all(row[name] == alone[name] for name in ("outcome", "reward", "terminated", "truncated"))
@@ -122,8 +140,9 @@ def test_the_end_of_any_row_is_returned() -> None:
         rows = np.zeros(2, row_type(1))
         still = np.zeros(2)
         sound, steps = np.zeros(2, bool), np.zeros(2, np.int64)
-        assert judge(still, still, np.array(ended), sound, steps, RULES, rows) == any(ended)
-        assert judge(still, still, sound, np.array(ended), steps, RULES, rows) == any(ended)
+        assert judge(still, still, np.array(ended), sound, sound, steps, RULES, rows) == any(ended)
+        assert judge(still, still, sound, sound, np.array(ended), steps, RULES, rows) == any(ended)
+        assert judge(still, still, sound, np.array(ended), sound, steps, RULES, rows) == any(ended)
 
 
 def boxes(*values: tuple[float, float, float, float]) -> np.ndarray:
@@ -212,17 +231,18 @@ def test_a_decision_s_rewards_are_summed_up_and_its_end_is_kept() -> None:
 def test_infos_of_a_row() -> None:
     rows = np.zeros(2, row_type(2))
     rows["outcome"], rows["time_s"], rows["traits"], rows["goal"] = [0, 1], 0.3, [[1, -1], [0, 0]], 2.5
+    rows["town"] = -1
     going_on, over = map(fields_of, rows)
-    assert set(observation_of(going_on)) == {"ego", "vehicles", "mask"}
-    begun = start_info(going_on, ("traits", "passed"))
+    assert set(observation_of(going_on, Contents())) == {"ego", "vehicles", "mask"}
+    begun = start_info(going_on, Contents(slot_infos=("traits", "passed")))
     assert begun["traits"].tolist() == [1, -1] and begun["passed"].tolist() == [0, 0]
     assert {name: begun[name] for name in ("outcome", "time_s")} == {"outcome": "", "time_s": 0.3}
     assert set(begun) == {"traits", "passed", "outcome", "time_s"}
     begun["traits"][:] = 5
     assert rows["traits"][0].tolist() == [1, -1], "an info keeps its values"
     terms = {"goal": 2.5, "collision": 0.0, "speed": 0.0, "step": 0.0}
-    assert set(step_info(going_on, ("traits",), {})) == {"traits", "outcome", "time_s", "reward_terms"}
-    info = step_info(over, (), {"trait": "aggressive"})
+    assert set(step_info(going_on, Contents(), {})) == {"traits", "outcome", "time_s", "reward_terms"}
+    info = step_info(over, Contents(slot_infos=()), {"trait": "aggressive"})
     assert info.pop("reward_terms") == terms
     assert info == {"outcome": "success", "time_s": 0.3, "is_success": True, "collision": {"trait": "aggressive"}}
     assert end_info("timeout", {}) == {"is_success": False}

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from tint_sumo.config import PolicySettings
 from tint_sumo.core.errors import InputError
+from tint_sumo.envs.perceived import perceived_spaces
 from tint_sumo.policy.network import AttentionExtractor, GruPolicy
 from tint_sumo.policy.wrappers import TRUE_TRAITS
 
@@ -105,6 +106,23 @@ def test_street_without_vehicles(extractor: AttentionExtractor) -> None:
     assert torch.isfinite(features).all()
     assert all(p.grad is None or torch.isfinite(p.grad).all() for p in extractor.parameters())
     assert torch.equal(extractor.attention(observations), torch.zeros(3, 12))
+
+
+def test_what_is_observed_of_the_road_has_influence_and_is_the_last_input() -> None:
+    torch.manual_seed(0)
+    without = AttentionExtractor(STREET_WITH_TRAITS)
+    torch.manual_seed(0)
+    road = perceived_spaces(("traffic_light", "lane"))
+    extractor = AttentionExtractor(spaces.Dict({**STREET_WITH_TRAITS.spaces, **road}))
+    assert [one.shape for one in without.embed.parameters()] == [one.shape for one in extractor.embed.parameters()]
+    assert extractor.joint[0].in_features == without.joint[0].in_features + 8 + 2  # type: ignore[operator, union-attr]
+    light, lane = torch.zeros(4, 8), torch.ones(4, 2)
+    observations = {**scene(4), "traffic_light": light, "lane": lane}
+    red = light.clone()
+    red[:, 0] = 1.0
+    features = extractor(observations)
+    assert not torch.equal(extractor({**observations, "traffic_light": red}), features)
+    assert not torch.equal(extractor({**observations, "lane": 2 * lane}), features)
 
 
 def test_attention_sums_to_one(extractor: AttentionExtractor) -> None:

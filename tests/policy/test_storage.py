@@ -111,6 +111,21 @@ def test_the_card_keeps_its_entries_and_describes_the_network(saved: Path) -> No
     assert card["network"]["settings"]["hidden_size"] == SMALL.hidden_size
 
 
+def test_the_card_names_what_is_observed_of_the_road(tmp_path: Path) -> None:
+    save_policy(make(), tmp_path / "plain", {})
+    assert "perceives" not in read_policy_card(tmp_path / "plain")["network"]
+    parts = {**observation_space(12, ("traffic_light", "lane")).spaces, TRAITS: trait_space(12, 2)}
+    policy = GruPolicy(spaces.Dict(parts), action_space(T), lambda _: 1e-3, settings=SMALL)
+    save_policy(policy, tmp_path / "road", {})
+    loaded = load_policy_network(tmp_path / "road")
+    assert loaded.observation_space == policy.observation_space
+    card = json.loads(card_file(tmp_path / "road").read_text())
+    card["network"]["perceives"] = ["lane"]
+    card_file(tmp_path / "road").write_text(json.dumps(card))
+    with pytest.raises(InputError, match=r"road\.json"):
+        load_policy_network(tmp_path / "road")
+
+
 def test_names_may_have_dots(tmp_path: Path) -> None:
     save_policy(make(), tmp_path / "vae-P0.4", {})
     assert {path.name for path in tmp_path.iterdir()} == {"vae-P0.4.json", "vae-P0.4.safetensors"}

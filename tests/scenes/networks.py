@@ -30,6 +30,12 @@ _GRID_FLOWS = "".join(
     )
 )
 _GRID_ROUTES = f'<routes>\n    <vType id="lorry" vClass="truck"/>\n{_GRID_FLOWS}</routes>\n'
+_LIGHTS_ROUTES = """<routes>
+    <vType id="car"/>
+    <flow id="across" type="car" from="bottom0A0" to="A1top0" begin="0" end="3600" period="exp(0.2)"/>
+    <flow id="oncoming" type="car" from="right0B0" to="A0left0" begin="0" end="3600" period="exp(0.2)"/>
+</routes>
+"""
 _MERGE_NODES = """<nodes>
     <node id="west" x="0" y="0"/>
     <node id="middle" x="150" y="0" type="priority"/>
@@ -102,6 +108,24 @@ def merge(folder: Path) -> UserNetwork:
     step = '<step-length value="0.1"/>'
     sumocfg = write_config(folder / "merge.sumocfg", "merge.net.xml", "merge.rou.xml", step)
     return UserNetwork(sumocfg, ("ramp", "out"), 20.0, 130.0)
+
+
+def lights(folder: Path, step_s: float = 0.1, program: str = "") -> UserNetwork:
+    """Two crossings by two with traffic lights and two lanes per direction; the ego drives straight on over two.
+
+    Args:
+        folder: for the files.
+        step_s: step length.
+        program: a tlLogic for the additional file; without one, lights have the programs of netgenerate.
+    """
+    options = "--grid --grid.x-number 2 --grid.y-number 2 --grid.length 80 --grid.attach-length 80 -L 2"
+    kind = ("--default-junction-type", "traffic_light")
+    _run("netgenerate", *options.split(), *kind, "-o", str(folder / "lights.net.xml"))
+    (folder / "lights.rou.xml").write_text(_LIGHTS_ROUTES)
+    (folder / "lights.add.xml").write_text(f"<additional>{program}</additional>")
+    more = f'<additional-files value="lights.add.xml"/><step-length value="{step_s}"/>'
+    sumocfg = write_config(folder / f"lights_{step_s}.sumocfg", "lights.net.xml", "lights.rou.xml", more)
+    return UserNetwork(sumocfg, ("left0A0", "A0B0", "B0right0"), 20.0, 200.0, (0.0, 5.0, 10.0))
 
 
 USER_NETWORKS: dict[str, Callable[[Path], UserNetwork]] = {

@@ -113,6 +113,12 @@ def test_a_sumo_configuration(user_network: Callable[[str], UserNetwork]) -> Non
     scene = read_scene({"sumocfg": str(merge.sumocfg), **task})
     assert scene == merge.scene()
     assert read_described(described([scene])) == (scene,)
+    assert "perceives" not in described([scene])["scene_settings"], "cards are as before where nothing is perceived"
+    watchful = read_scene({"sumocfg": str(merge.sumocfg), **task, "perceives": "lane", "red_light": "end"})
+    assert watchful == replace(scene, perceives=("lane",), red_light="end")
+    assert read_described(described([watchful])) == (watchful,)
+    driven = replace(scene, ego_control="sumo")
+    assert read_described(described([driven])) == (driven,)
     with pytest.raises(InputError, match=r"scene: the ego's start \(20 m\) and goal \(900 m\) must lie on its route"):
         read_scene({"sumocfg": str(merge.sumocfg), **task, "goal_m": 900}, ("scene",))
 

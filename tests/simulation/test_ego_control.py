@@ -74,5 +74,5 @@ def test_sumos_driver_that_comes_to_the_end_of_its_route_has_arrived(by_actions:
 
 
 def test_other_drivers_of_the_ego_are_refused(by_actions: SumocfgScene) -> None:
-    with pytest.raises(InputError, match=r"ego_control must be 'speed' or 'sumo', not 'human'"):
+    with pytest.raises(InputError, match=r"ego_control must be one of speed, sumo, not 'human'"):
         replace(by_actions, ego_control="human")  # type: ignore[arg-type]

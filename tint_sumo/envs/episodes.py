@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -18,19 +19,32 @@ from tint_sumo.config import (
     Backend,
     Decisions,
     Mix,
+    Perceivable,
     Sensor,
     TauS,
     TimeS,
 )
 from tint_sumo.core.errors import InputError, find_named, shown
 from tint_sumo.core.ranges import require_ranges
+from tint_sumo.envs.perceived import (
+    add_up_red_lights,
+    judge_red_lights,
+    observe_road,
+    perceived_fields,
+    perceived_spaces,
+)
 from tint_sumo.envs.rendering import render_scene
 from tint_sumo.envs.rows import (
     BOUND,
     COLLISION,
+    COST,
     GOING_ON,
+    OBSERVATION_KEYS,
+    RED_LIGHT_TERM,
+    REWARD_TERMS,
     TRACKS,
     TRUTH,
+    Contents,
     Rows,
     Scales,
     TaskRules,
@@ -42,10 +56,10 @@ from tint_sumo.envs.rows import (
     row_type,
 )
 from tint_sumo.envs.sensing import Sensing
-from tint_sumo.scenes import AnyScene, Scene, find_scene, paper_scene, require_built_in
+from tint_sumo.scenes import AnyScene, Scene, SumocfgScene, find_scene, paper_scene, require_built_in
 from tint_sumo.scenes.buildings import corner_buildings
 from tint_sumo.scenes.geometry import NO_VEHICLE, Floats
-from tint_sumo.simulation import make_simulation
+from tint_sumo.simulation import SumocfgSimulation, make_simulation
 from tint_sumo.simulation.timing import StepPart, does
 
 PEDESTRIAN = "pedestrian"  # in place of the trait of somebody on foot
@@ -132,11 +146,31 @@ class TaskSettings:
         scene = self.scene
         return scene.population.episodes_per_town if isinstance(scene, Scene) else 1
 
-    @property
-    def slot_infos(self) -> tuple[str, ...]:
-        """Fields of the infos that have a value for each vehicle slot."""
+    @cached_property
+    def contents(self) -> Contents:
+        """Fields of rows that observations and infos have."""
         truth = () if self.sensor == PERFECT else TRUTH
-        return ("traits", *(TRACKS if self.tracks else ()), *truth)
+        slot_infos = ("traits", *(TRACKS if self.tracks else ()), *truth)
+        if not isinstance(self.scene, SumocfgScene):
+            return Contents(slot_infos=slot_infos)
+        red_light = self.scene.red_light
+        return Contents(
+            (*OBSERVATION_KEYS, *perceived_spaces(self.scene.perceives)),
+            slot_infos,
+            REWARD_TERMS if red_light == "ignore" else (*REWARD_TERMS, RED_LIGHT_TERM),
+            (COST,) if red_light == "cost" else (),
+        )
+
+    @property
+    def row_type(self) -> np.dtype[np.void]:
+        """Type of an environment's record."""
+        return row_type(self.played.max_vehicles, perceived_fields(self.scene))
+
+    @property
+    def observation_space(self) -> spaces.Dict:
+        """Space of an environment's observations."""
+        perceives = self.scene.perceives if isinstance(self.scene, SumocfgScene) else ()
+        return observation_space(self.played.max_vehicles, perceives)
 
     @cached_property
     def played(self) -> AnyScene:
@@ -169,12 +203,14 @@ def action_space(scene: AnyScene) -> spaces.Discrete:
     return spaces.Discrete(len(scene.ego.controller.desired_speeds_mps))
 
 
-def observation_space(max_vehicles: int) -> spaces.Dict:
+def observation_space(max_vehicles: int, perceives: Iterable[Perceivable] = ()) -> spaces.Dict:
+    """Return the space of observations with so many vehicle slots, and with further keys by their names."""
     return spaces.Dict(
         {
             "ego": spaces.Box(-BOUND, BOUND, (4,), np.float32),
             "vehicles": spaces.Box(-BOUND, BOUND, (max_vehicles, 2), np.float32),
             "mask": spaces.Box(0.0, 1.0, (max_vehicles,), np.float32),
+            **perceived_spaces(perceives),
         }
     )
 
@@ -222,7 +258,7 @@ class Episodes:
         self.settings = settings
         scene = settings.played
         self.simulation = make_simulation(num_envs, scene, settings.backend)
-        self.rows = np.zeros(num_envs, row_type(scene.max_vehicles)) if rows is None else rows
+        self.rows = np.zeros(num_envs, settings.row_type) if rows is None else rows
         traits = (*self.simulation.trait_of_member, NO_VEHICLE)  # the last one stands for empty slots
         self._trait_of_member = np.array(traits, np.int16)
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
@@ -233,6 +269,9 @@ class Episodes:
         self._parked: set[int] = set()
         self._reveals = settings.sensor != PERFECT
         self.sensing = Sensing(settings.sensor, self.simulation, scene.step_s)
+        self._network: SumocfgSimulation | None = None  # the simulation of a scene whose rows have more fields
+        if isinstance(self.simulation, SumocfgSimulation) and perceived_fields(scene):
+            self._network = self.simulation
 
     def begin(self, index: int, seed: int) -> None:
         """Start a new episode in an environment."""
@@ -275,6 +314,8 @@ class Episodes:
             before = self.rows.copy()
             any_ended |= self._step(np.where(over, 0.0, desired_mps))
             add_up(before, self.rows)
+            if self._network is not None:
+                add_up_red_lights(before, self.rows)
         return any_ended
 
     def _step(self, desired_mps: Floats) -> bool:
@@ -287,7 +328,11 @@ class Episodes:
         self.steps += 1
         self._observe(slice(0, len(self.steps)))
         egos = simulation.egos
-        return judge(egos.front_m, egos.speed_mps, egos.collided, egos.lost, self.steps, self._rules, self.rows)
+        ends = (egos.collided, egos.ran_red, egos.lost)
+        any_ended = judge(egos.front_m, egos.speed_mps, *ends, self.steps, self._rules, self.rows)
+        if self._network is not None:
+            judge_red_lights(self._network, self._rules.collision, self.rows)
+        return any_ended
 
     @does(StepPart.OBSERVATION)
     def _observe(self, envs: slice) -> None:
@@ -307,6 +352,8 @@ class Episodes:
             self._scales,
             rows,
         )
+        if self._network is not None:
+            observe_road(self._network, rows)
         if self.settings.tracks:
             self._observe_tracks(envs)
         if self._reveals:

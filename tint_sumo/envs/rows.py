@@ -21,17 +21,28 @@ SEEN = ("vehicles", "mask", "traits", "track", "slot", *TRACKS)  # what the sens
 TRUTH = ("track", "slot", "true_mask", "true_vehicles", "true_traits")  # per vehicle slot, if the sensor is not perfect
 SLOT_INFOS = ("traits", *TRACKS, *TRUTH)  # what infos can have for each vehicle slot
 REWARD_TERMS = ("goal", "collision", "speed", "step")
-Outcome = Literal["success", "timeout", "collision", "lost"]
+RED_LIGHT_TERM, COST = "red_light", "cost"  # fields of rows where driving over stop lines at red has consequences
+Outcome = Literal["success", "timeout", "collision", "lost", "red_light"]
 OUTCOMES: tuple[str, ...] = get_args(Outcome)
 BUILT_IN_OUTCOMES = OUTCOMES[:3]  # SUMO takes no ego off the roads of built-in scenes
-GOING_ON, _SUCCESS, _TIMEOUT, COLLISION, _LOST = range(5)  # numbers of outcomes in rows: positions in OUTCOMES, plus 1
+# Numbers of outcomes in rows: positions in OUTCOMES, plus 1.
+GOING_ON, _SUCCESS, _TIMEOUT, COLLISION, _LOST, RED_LIGHT = range(6)
 BOUND = 2.0  # limit of normalised observations: 40 m, 6 m/s
 
 Rows = NDArray[np.void]  # records (N,) of a row type
 
 
-def row_type(max_vehicles: int) -> np.dtype[np.void]:
-    """Return the type of an environment's record, with so many vehicle slots."""
+class Contents(NamedTuple):
+    """Fields of rows that observations and infos have."""
+
+    keys: tuple[str, ...] = OBSERVATION_KEYS  # of the observation
+    slot_infos: tuple[str, ...] = ("traits",)  # infos with a value for each vehicle slot
+    terms: tuple[str, ...] = REWARD_TERMS
+    step_infos: tuple[str, ...] = ()  # further infos after a step
+
+
+def row_type(max_vehicles: int, more: Sequence[tuple[str, Any, tuple[int, ...]]] = ()) -> np.dtype[np.void]:
+    """Return the type of an environment's record, with so many vehicle slots and with more fields."""
     slots = (max_vehicles,)
     layout = np.dtype(
         [
@@ -54,6 +65,7 @@ def row_type(max_vehicles: int) -> np.dtype[np.void]:
             ("truncated", np.bool_),
             ("reward", np.float64),
             *((term, np.float64) for term in REWARD_TERMS),
+            *more,
         ],
         align=True,
     )
@@ -65,7 +77,9 @@ _OUTCOME_NAMES = np.array(["", *OUTCOMES], object)  # by their numbers in rows
 
 def outcomes_in(scene: Scene | SumocfgScene) -> tuple[str, ...]:
     """Return the outcomes that episodes of a scene can have."""
-    return OUTCOMES if isinstance(scene, SumocfgScene) else BUILT_IN_OUTCOMES
+    if not isinstance(scene, SumocfgScene):
+        return BUILT_IN_OUTCOMES
+    return OUTCOMES if scene.red_light == "end" else OUTCOMES[:-1]
 
 
 def outcome_name(code: int) -> str:
@@ -83,14 +97,14 @@ def fields_of(row: np.void | Rows) -> dict[str, Any]:
     return dict(zip(row.dtype.names or (), row.item(), strict=True))
 
 
-def observation_of(fields: Mapping[str, NDArray[Any]]) -> Observation:
+def observation_of(fields: Mapping[str, NDArray[Any]], contents: Contents) -> Observation:
     """Return the observation among the fields of a row, or of all rows."""
-    return {key: fields[key] for key in OBSERVATION_KEYS}
+    return {key: fields[key] for key in contents.keys}
 
 
-def start_info(fields: Mapping[str, Any], slot_infos: Sequence[str]) -> dict[str, Any]:
-    """Return the info of an environment after a reset; ``slot_infos`` are the fields per vehicle slot that it holds."""
-    slots = {key: fields[key].copy() for key in slot_infos}
+def start_info(fields: Mapping[str, Any], contents: Contents) -> dict[str, Any]:
+    """Return the info of an environment after a reset."""
+    slots = {key: fields[key].copy() for key in contents.slot_infos}
     return {
         **slots,
         "outcome": outcome_name(fields["outcome"]),
@@ -104,10 +118,11 @@ def town_info(town: int) -> dict[str, int]:
     return {} if town == NO_TOWN else {"town": town}
 
 
-def step_info(fields: Mapping[str, Any], slot_infos: Sequence[str], collision: dict[str, Any]) -> dict[str, Any]:
+def step_info(fields: Mapping[str, Any], contents: Contents, collision: dict[str, Any]) -> dict[str, Any]:
     """Return the info of an environment after a step; ``collision`` is empty without one."""
-    info = start_info(fields, slot_infos)
-    info["reward_terms"] = {term: fields[term] for term in REWARD_TERMS}
+    info = start_info(fields, contents)
+    info["reward_terms"] = {term: fields[term] for term in contents.terms}
+    info |= {name: fields[name] for name in contents.step_infos}
     return info | end_info(info["outcome"], collision) if info["outcome"] else info
 
 
@@ -152,6 +167,7 @@ def judge(
     front_m: Floats,
     speed_mps: Floats,
     collided: Bools,
+    ran_red: Bools,
     lost: Bools,
     steps: Numbers,
     rules: TaskRules,
@@ -160,7 +176,7 @@ def judge(
     """Write outcomes and rewards of the step just made (paper IV-A); return whether any episode has ended.
 
     Args:
-        front_m, speed_mps, collided, lost: (N,) of the egos.
+        front_m, speed_mps, collided, ran_red, lost: (N,) of the egos.
         steps: (N,) since the episodes' start.
     """
     any_ended = False
@@ -168,13 +184,15 @@ def judge(
         row = rows[index]
         if collided[index]:
             row.outcome = COLLISION
+        elif ran_red[index]:
+            row.outcome = RED_LIGHT
         elif front_m[index] > rules.goal_m:
             row.outcome = _SUCCESS
         elif lost[index]:
             row.outcome = _LOST
         else:
             row.outcome = _TIMEOUT if steps[index] >= rules.step_limit else GOING_ON
-        row.terminated = row.outcome in (_SUCCESS, COLLISION)
+        row.terminated = row.outcome in (_SUCCESS, COLLISION, RED_LIGHT)
         row.truncated = row.outcome in (_TIMEOUT, _LOST)
         row.goal = rules.goal if row.outcome == _SUCCESS else 0.0
         row.collision = rules.collision if row.outcome == COLLISION else 0.0

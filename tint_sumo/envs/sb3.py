@@ -69,19 +69,23 @@ class SceneVecEnv(VecEnv):
         rows, ended = self.env.advance(self._actions)
         self._keep_slots(rows)
         listed = _listed(rows["traits"], rows["town"])
+        contents = self.env.contents
+        for name in contents.step_infos:
+            for info, value in zip(listed, rows[name].tolist(), strict=True):
+                info[name] = value
         for end in ended:
             last = fields_of(end.row)
             listed[end.index] |= {
-                "terminal_observation": observation_of(last),
+                "terminal_observation": observation_of(last, contents),
                 "TimeLimit.truncated": last["truncated"],
-                "terminal_slots": {key: last[key] for key in self.env.slot_infos},
+                "terminal_slots": {key: last[key] for key in contents.slot_infos},
                 "outcome": end.outcome,
                 "time_s": last["time_s"],
                 **town_info(last["town"]),
                 **end_info(end.outcome, end.collision),
             }
         done = rows["terminated"] | rows["truncated"]
-        return observation_of(rows), rows["reward"].astype(np.float32), done, listed
+        return observation_of(rows, contents), rows["reward"].astype(np.float32), done, listed
 
     def snapshot(self) -> list[Snapshot]:
         """Return snapshots, as ``SceneVectorEnv`` does."""
@@ -94,7 +98,7 @@ class SceneVecEnv(VecEnv):
         return observation
 
     def _keep_slots(self, infos: dict[str, Any]) -> None:
-        self.slots = {key: infos[key] for key in self.env.slot_infos}
+        self.slots = {key: infos[key] for key in self.env.contents.slot_infos}
 
     def close(self) -> None:
         self.env.close()

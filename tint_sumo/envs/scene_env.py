@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Snapshot, checked_snapshots
 from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_options, checked_seed
-from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings, action_space, observation_space
+from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings, action_space
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
-from tint_sumo.envs.rows import OBSERVATION_KEYS, Observation, fields_of, start_info, step_info
+from tint_sumo.envs.rows import Observation, fields_of, observation_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
 from tint_sumo.simulation import Simulation
 
@@ -44,6 +44,21 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `vehicles` | `(V, 2)` | x, y of each vehicle's centre minus the ego's, with noise; 0 in empty slots        |
     | `mask`     | `(V,)`   | 1 where the slot holds a vehicle                                                   |
 
+    In a SUMO configuration, `perceives` of the scene adds keys of the ego's road:
+
+    | Key             | Shape  | Content                                                                           |
+    |-----------------|--------|-----------------------------------------------------------------------------------|
+    | `traffic_light` | `(8,)` | the next traffic light on the ego's route: six numbers of which one is 1 (red or  |
+    |                 |        | red with yellow, yellow, green with priority, green without priority, stop and    |
+    |                 |        | then go, switched off); the distance from the ego's front to its stop line / 20 m,|
+    |                 |        | up to 5 (100 m); time in this state / 10 s, up to 10 (100 s). Without one to come |
+    |                 |        | the distance is 5, and all else 0                                                 |
+    | `speed_limit`   | `(1,)` | speed limit of the ego's lane, divided by the scale of its velocity, up to 2      |
+    | `lane`          | `(2,)` | number of the ego's lane, 0 at the outer side of its edge (to the right in        |
+    |                 |        | right-hand traffic), and how many lanes the edge has; on junctions of their lanes |
+
+    The ego knows them as they are; the sensor is for other road users.
+
     A vehicle keeps its slot for as long as it is on the roads and perceived; a slot stays empty for at least one step
     between two vehicles. The others' velocities and traits are not observed.
 
@@ -58,7 +73,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `step`      | -0.0013 otherwise                 | -0.013 otherwise                  |
 
     In a SUMO configuration with steps of T s and a top speed of M m/s, `step` is multiplied by T / 0.1, and `speed` by
-    T / 0.1 x 3 / M: a second is worth as much as in the built-in scenes.
+    T / 0.1 x 3 / M: a second is worth as much as in the built-in scenes. If red lights have consequences there (see
+    Arguments), `red_light` is a term, too.
 
     ## Starting State
     The ego stands at its start (in the T-intersection with its centre at (0, -5)). All of the traffic's routes are
@@ -66,8 +82,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     ## Episode End
     Termination: the ego passes its goal (`success`; in the T-intersection its centre is at x = 8 m on the upper lane
-    then), or its box touches another vehicle's (`collision`). Truncation: the time limit (`timeout`), or,
-    in a SUMO configuration, that SUMO takes the ego off the road (`lost`): it removes or teleports vehicles that have
+    then), or its box touches another vehicle's (`collision`). In a SUMO configuration with `red_light="end"`, so is
+    driving over a stop line at red (`red_light`). Truncation: the time limit (`timeout`), or, in a SUMO
+    configuration, that SUMO takes the ego off the road (`lost`): it removes or teleports vehicles that have
     waited for longer than `time-to-teleport`, and calibrators remove them.
 
     ## Information
@@ -82,11 +99,13 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `slot`         | simulation's slot with its vehicle; -1 in empty slots                                       |
     | `true_mask`,   | with a sensor: `(V,)` and `(V, 2)`, the simulation's slots as they are, seen or not, with   |
     | `true_vehicles`| their traits in `true_traits`: not to be used by policies                                   |
-    | `outcome`      | `"success"`, `"collision"`, `"timeout"`, `"lost"`, or `""` while the episode goes on        |
+    | `outcome`      | `"success"`, `"collision"`, `"timeout"`, `"lost"`, `"red_light"`, or `""` while the episode  |
+    |                | goes on                                                                                     |
     | `reward_terms` | the reward's named terms (after a step)                                                     |
     | `time_s`       | time since the episode's start                                                              |
     | `town`         | in a population with towns: number of the episode's town                                    |
     | `is_success`   | at the episode's end: whether the outcome is `"success"`                                    |
+    | `cost`         | after a step, with `red_light="cost"`: number of stop lines driven over at red in it        |
     | `collision`    | after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`; for a person   |
     |                | on foot in a SUMO configuration, `trait` is `"pedestrian"` and `slot` is -1                 |
 
@@ -99,7 +118,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
       included; `ego` is seen from where it starts, with the network's axes, its velocities divided by its top speed if
       that is above 3 m/s; `vehicles` are the nearest in sight;
       `traits` are the numbers of their vTypes in `scene.vtypes`; `position_m` is what their odometers show, and
-      `passed` is always 0. Such an environment is one simulation: a vector of them needs as many `workers` as
+      `passed` is always 0. `perceives`, `red_light` and `ego_control` are arguments of the scene, which `from_sumocfg`
+      describes. Such an environment is one simulation: a vector of them needs as many `workers` as
       environments.
     * `p_conservative`: probability that a driver is conservative, in [0, 1]; default 0.4. Two numbers are a range, from
       which each episode draws its probability uniformly, by its seed.
@@ -154,9 +174,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._spec: EnvSpec | None = None
         self._max_episode_steps = settings.decisions_per_episode
         self._window = Window(settings.played.name, fps) if render_mode == "human" else None
-        self.observation_space = observation_space(settings.played.max_vehicles)
+        self.observation_space = settings.observation_space
         self.action_space: gymnasium.spaces.Discrete = action_space(settings.played)
-        self._slot_infos = settings.slot_infos
+        self._contents = settings.contents
         self._settings = settings
         self._calls = Calls()
         self._episodes = Episodes(1, settings)
@@ -218,8 +238,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
             self._step(actions)
         self._show()
         fields = fields_of(self._episodes.rows)
-        info = step_info(fields, self._slot_infos, self._episodes.collision_info(0))
-        return _observation(fields), fields["reward"], fields["terminated"], fields["truncated"], info
+        info = step_info(fields, self._contents, self._episodes.collision_info(0))
+        return self._observation(fields), fields["reward"], fields["terminated"], fields["truncated"], info
 
     def _step(self, actions: NDArray[np.integer]) -> None:
         self._actions.append(int(actions[0]))
@@ -261,7 +281,10 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     def _shown(self) -> tuple[Observation, dict[str, Any]]:
         """Return the observation and info of the present step."""
         fields = fields_of(self._episodes.rows)
-        return _observation(fields), start_info(fields, self._slot_infos)
+        return self._observation(fields), start_info(fields, self._contents)
+
+    def _observation(self, fields: dict[str, Any]) -> Observation:
+        return {key: part.copy() for key, part in observation_of(fields, self._contents).items()}
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return an (H, W, 3) image of the scene; conservative drivers blue, aggressive red, the ego yellow.
@@ -304,7 +327,3 @@ class SceneEnv(gymnasium.Env[Any, Any]):
             drawn = self.np_random.bit_generator.state
             self.restore(self.snapshot())
             self.np_random.bit_generator.state = drawn  # also what the user has drawn from it since the reset
-
-
-def _observation(fields: dict[str, Any]) -> Observation:
-    return {key: fields[key].copy() for key in OBSERVATION_KEYS}

@@ -23,11 +23,10 @@ from tint_sumo.envs.calls import (
     checked_options,
     checked_seeds,
 )
-from tint_sumo.envs.episodes import TaskSettings, action_space, observation_space
+from tint_sumo.envs.episodes import TaskSettings, action_space
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
 from tint_sumo.envs.rows import (
     GOING_ON,
-    REWARD_TERMS,
     Observation,
     copied,
     end_info,
@@ -89,13 +88,15 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         first = settings[0]
         if len({task.played.max_vehicles for task in settings}) > 1:
             raise InputError("scenes of one environment must observe the same number of vehicles; change max_vehicles")
+        if len({task.contents for task in settings}) > 1:
+            raise InputError("scenes of one environment must have the same `perceives` and `red_light`; change them")
         self._mode = _autoreset_mode(autoreset_mode)
         fps = render_fps(first.decision_s)
         self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
         self.num_envs = num_envs
-        self.slot_infos = first.slot_infos
+        self.contents = first.contents
         self.render_mode = render_mode
-        self.single_observation_space = observation_space(first.played.max_vehicles)
+        self.single_observation_space = first.observation_space
         self.single_action_space: spaces.Discrete = action_space(first.played)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -156,10 +157,12 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             begun[[end.index for end in ended]] = True
         infos = self._infos(rows)
         if not begun.all():  # an episode that begins has no rewards yet
-            infos |= _masked({"reward_terms": _masked({term: rows[term] for term in REWARD_TERMS}, ~begun)}, ~begun)
+            terms = _masked({term: rows[term] for term in self.contents.terms}, ~begun)
+            more = {name: rows[name] for name in self.contents.step_infos}
+            infos |= _masked({"reward_terms": terms, **more}, ~begun)
         for end in ended:
             infos = self._add_info(infos, self._ending(end), end.index)
-        return observation_of(rows), rows["reward"], rows["terminated"], rows["truncated"], infos
+        return observation_of(rows, self.contents), rows["reward"], rows["terminated"], rows["truncated"], infos
 
     def advance(self, actions: NDArray[np.int64]) -> tuple[dict[str, NDArray[Any]], list[Ended]]:
         """Take a step; return the fields of all rows after it, and the episodes that ended in it.
@@ -170,7 +173,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         taken = checked_actions(actions, (self.num_envs,), int(self.single_action_space.n))
         with self._calls:
             ended = self.batch.step(taken)
-        rows = copied(self.batch.rows, self.slot_infos)
+        rows = copied(self.batch.rows, self.contents.slot_infos)
         for end in ended:
             for key in ("reward", "terminated", "truncated"):
                 rows[key][end.index] = end.row[key]
@@ -220,12 +223,12 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _shown(self, mask: NDArray[np.bool_] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Return the observation of the present steps, and the infos of the environments in the mask, or of all."""
-        rows = copied(self.batch.rows, self.slot_infos)
-        return observation_of(rows), self._infos(rows, mask)
+        rows = copied(self.batch.rows, self.contents.slot_infos)
+        return observation_of(rows, self.contents), self._infos(rows, mask)
 
     def _infos(self, rows: dict[str, NDArray[Any]], mask: NDArray[np.bool_] | None = None) -> dict[str, Any]:
         """Return the infos of the environments in a mask, or of all; 0 or None elsewhere, as gymnasium has it."""
-        infos = {**{key: rows[key] for key in self.slot_infos}, "outcome": outcome_names(rows["outcome"])}
+        infos = {**{key: rows[key] for key in self.contents.slot_infos}, "outcome": outcome_names(rows["outcome"])}
         infos["time_s"] = rows["time_s"]
         shown = np.ones(self.num_envs, bool) if mask is None else mask.copy()
         if not shown.all():
@@ -240,7 +243,8 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if self._mode is not AutoresetMode.SAME_STEP:
             return end_info(ended.outcome, ended.collision)
         last = fields_of(ended.row)
-        return {"final_obs": observation_of(last), "final_info": step_info(last, self.slot_infos, ended.collision)}
+        final = step_info(last, self.contents, ended.collision)
+        return {"final_obs": observation_of(last, self.contents), "final_info": final}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return an (H, W, 3) image per environment."""

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from tint_sumo.core.processes import result_of, start_worker, value_of
 from tint_sumo.envs.batch import Ended, LocalBatch, Snapshot
 from tint_sumo.envs.episodes import TaskSettings
-from tint_sumo.envs.rows import Rows, row_type
+from tint_sumo.envs.rows import Rows
 from tint_sumo.simulation.connection import libsumo_is_free
 
 _ENDING_S = 10.0  # more than enough for a step, and to close a simulation
@@ -46,7 +46,7 @@ class WorkerBatch:
 
     def __init__(self, num_envs: int, settings: Sequence[TaskSettings], autoreset_mode: AutoresetMode) -> None:
         workers = len(settings)
-        shared = _Shared(num_envs, workers, settings[0].played.max_vehicles)
+        shared = _Shared(num_envs, workers, settings[0].row_type)
         self._shares = shares_of(num_envs, workers)
         self.rows = shared.rows
         self._local: LocalBatch | None = None
@@ -151,10 +151,10 @@ class _Shared:
     It has no name in the file system: nothing is left of it when the last process ends, however it ends.
     """
 
-    def __init__(self, num_envs: int, workers: int, max_vehicles: int) -> None:
+    def __init__(self, num_envs: int, workers: int, row: np.dtype[np.void]) -> None:
         self._num_envs = num_envs
         self._workers = workers
-        self._row = row_type(max_vehicles)
+        self._row = row
         self._rows_at = 2 * workers * _INTEGER.itemsize
         self._memory = RawArray("B", self._rows_at + num_envs * self._row.itemsize)
 

@@ -28,7 +28,13 @@ EGO_COLOUR, _UNSURE, _WHITE = (240, 180, 0), (190, 190, 190), (255, 255, 255)
 _LAMP, _GLASS, _INK, _PAPER, _FAINT = (255, 40, 40), (43, 47, 51), (30, 33, 37), (250, 250, 247), (110, 116, 122)
 _HALO, _CLAIM, _WAY = (255, 225, 60, 105), (0, 150, 140, 75), (240, 180, 0, 130)
 _HALO_KEY, _CLAIM_KEY = (225, 210, 95), (100, 149, 151)  # how they look on the road
-_OUTCOMES = {"success": (30, 140, 70), "collision": (200, 40, 40), "timeout": (150, 90, 0), "lost": (110, 60, 140)}
+_OUTCOMES = {
+    "success": (30, 140, 70),
+    "collision": (200, 40, 40),
+    "timeout": (150, 90, 0),
+    "lost": (110, 60, 140),
+    "red_light": (200, 40, 40),
+}
 
 
 @dataclass(frozen=True)

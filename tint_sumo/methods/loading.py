@@ -19,6 +19,7 @@ from tint_sumo.core.errors import InputError, NotFiniteError
 from tint_sumo.core.files import shipped
 from tint_sumo.core.structures import FieldError, build
 from tint_sumo.envs import TaskSettings
+from tint_sumo.envs.perceived import perceived_in
 from tint_sumo.methods.registry import METHODS, Learned, Policy, Rule, find_learned
 from tint_sumo.methods.rules import ACTIONS as RULE_ACTIONS
 from tint_sumo.methods.training import POLICY, TRAITS, digest
@@ -106,15 +107,18 @@ def _in_scene(contender: Contender, scene: AnyScene) -> Contender:
     """Return the policy for another scene.
 
     Raises:
-        InputError: the scene has other numbers of observed vehicles or of actions.
+        InputError: the scene has other numbers of observed vehicles or of actions, or other keys in its observations.
     """
     network: Any = contender.policy
     is_rule = contender.source is None
     vehicles = scene.max_vehicles if is_rule else network.observation_space["vehicles"].shape[0]
     actions = RULE_ACTIONS if is_rule else network.action_space.n
+    perceives = scene.perceives if isinstance(scene, SumocfgScene) else ()
+    needed = perceives if is_rule else perceived_in(network.observation_space.spaces)
     for what, wanted, there in (
         ("max_vehicles", vehicles, scene.max_vehicles),
         ("desired_speeds_mps", actions, len(scene.ego.controller.desired_speeds_mps)),
+        ("perceives", ", ".join(needed) or "nothing", ", ".join(perceives) or "nothing"),
     ):
         if wanted != there:
             raise InputError(f"policy {contender.name} needs {what} of {wanted}, and scene {scene.name} has {there}")

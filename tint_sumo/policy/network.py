@@ -18,6 +18,7 @@ from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
 from tint_sumo.traits.encoder import perceptron
 
 OBSERVATION_KEYS = frozenset({"ego", "vehicles", "mask", TRAITS})
+_ROAD = ("traffic_light", "speed_limit", "lane")  # keys that observations may have of the ego's road
 _FAR_BELOW = -1e9  # score of an empty slot; finite, so that a street without vehicles gives no NaN
 
 
@@ -37,8 +38,10 @@ class AttentionExtractor(BaseFeaturesExtractor):
     - The code puts a ReLU on the scores before the softmax and passes each e_i through a 100-100-50 network before the
       sum. Here scores may be negative, and the sum is of the e_i, as in the paper, before one 100-50 layer.
 
+    What else is observed of the ego's road (``tint_sumo.envs.perceived``) joins the ego state in the last layers.
+
     Args:
-        observation_space: Dict of ego (E,), vehicles (V, 2), mask (V,) and traits (V, Z).
+        observation_space: Dict of ego (E,), vehicles (V, 2), mask (V,) and traits (V, Z), and keys of the road.
         settings: layer sizes.
 
     Raises:
@@ -64,7 +67,9 @@ class AttentionExtractor(BaseFeaturesExtractor):
             else None
         )
         self.context = perceptron(embedded, settings.context_size)
-        self.joint = perceptron(settings.context_size + ego_size, *settings.joint_sizes)
+        self.road = tuple(key for key in _ROAD if key in observation_space.spaces)
+        road_size = sum(_last_axis(observation_space, key) for key in self.road)
+        self.joint = perceptron(settings.context_size + ego_size + road_size, *settings.joint_sizes)
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
         """Return features (B, features_dim) of B observations."""
@@ -73,7 +78,8 @@ class AttentionExtractor(BaseFeaturesExtractor):
         weights = self._weights(observations["mask"], slots, rows, embedded)
         chosen = weights.flatten().index_select(0, slots).unsqueeze(-1)
         weighted = _sum_by_row(embedded * chosen.to(embedded.dtype), rows, len(ego))
-        features: Tensor = self.joint(torch.cat([self.context(weighted), ego], dim=-1))
+        road = (observations[key] for key in self.road)
+        features: Tensor = self.joint(torch.cat([self.context(weighted), ego, *road], dim=-1))
         return features
 
     def attention(self, observations: dict[str, Tensor]) -> Tensor:

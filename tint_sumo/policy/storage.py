@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from gymnasium import spaces
 from torch import Tensor
 
-from tint_sumo.config import PolicySettings, Slots
+from tint_sumo.config import Perceivable, PolicySettings, Slots
 from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_json, write_json
@@ -19,6 +19,7 @@ from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import FieldError, build
 from tint_sumo.core.weights import read_weights, write_weights
 from tint_sumo.envs.episodes import observation_space
+from tint_sumo.envs.perceived import perceived_in
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.trait_sources import OracleTraits
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS, trait_space
@@ -35,6 +36,7 @@ class _Network:
     critic_sees_true_traits: bool
     max_vehicles: Slots
     actions: Annotated[int, Range(1, 100)]
+    perceives: tuple[Perceivable, ...] = ()
 
 
 def save_policy(policy: GruPolicy, stem: Path, card: Mapping[str, Any]) -> None:
@@ -49,13 +51,15 @@ def save_policy(policy: GruPolicy, stem: Path, card: Mapping[str, Any]) -> None:
     assert isinstance(space, spaces.Dict) and isinstance(policy.action_space, spaces.Discrete)
     traits_shape = space[TRAITS].shape
     assert traits_shape is not None
-    network = {
+    network: dict[str, Any] = {
         "settings": asdict(policy.settings),
         "trait_size": traits_shape[-1],
         "critic_sees_true_traits": TRUE_TRAITS in space.spaces,
         "max_vehicles": traits_shape[0],
         "actions": int(policy.action_space.n),
     }
+    if perceives := perceived_in(space.spaces):
+        network["perceives"] = perceives
     checksum = write_weights(weights_file(stem), _weights_once(policy))
     write_json(card_file(stem), {**card, _NETWORK: network, **checksum})
 
@@ -124,7 +128,7 @@ def card_file(stem: Path) -> Path:
 
 def _build(network: _Network) -> GruPolicy:
     slots = network.max_vehicles
-    parts = {**observation_space(slots).spaces, TRAITS: trait_space(slots, network.trait_size)}
+    parts = {**observation_space(slots, network.perceives).spaces, TRAITS: trait_space(slots, network.trait_size)}
     if network.critic_sees_true_traits:
         parts[TRUE_TRAITS] = trait_space(slots, OracleTraits().size)
     actions = spaces.Discrete(network.actions)

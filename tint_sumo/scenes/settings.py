@@ -11,8 +11,12 @@ from tint_sumo.config import (
     ArrivalsPerS,
     Claim,
     DistanceM,
+    EgoControl,
     EgoController,
+    Penalty,
+    Perceivable,
     Population,
+    RedLight,
     RouteM,
     Slots,
     StepS,
@@ -152,6 +156,14 @@ class SumocfgSettings:
     """The ego's shape."""
     controller: EgoController = field(default_factory=EgoController)
     """Controller of the ego; its desired speeds are the actions."""
+    ego_control: EgoControl = SumocfgScene.ego_control
+    """Driver of the ego: the actions (speed), or SUMO's driver (sumo)."""
+    perceives: Many[Perceivable] = SumocfgScene.perceives
+    """Further keys of the observation."""
+    red_light: RedLight = SumocfgScene.red_light
+    """Consequence of driving over a stop line at red: none (ignore), a cost, or the episode's end."""
+    red_light_penalty: Penalty = SumocfgScene.red_light_penalty
+    """Taken from the reward for each stop line driven over at red, if that is a cost."""
 
     @classmethod
     def of(cls, scene: SumocfgScene) -> Self:
@@ -165,6 +177,9 @@ class SumocfgSettings:
 def _without(values: Mapping[str, Any], newer: Mapping[str, Any]) -> dict[str, Any]:
     """Return values without those that are newer, as long as they are the defaults given."""
     return {key: value for key, value in values.items() if key not in newer or value != newer[key]}
+
+
+_NEWER = ("ego_control", "perceives", "red_light", "red_light_penalty")  # settings that former cards do not have
 
 
 def _digest(settings: Mapping[str, Any]) -> str:
@@ -210,8 +225,13 @@ def described(scenes: Sequence[AnyScene]) -> dict[str, Any]:
     if others:
         return {"scene": ALL_SCENES, "scene_digest": digest_of(scenes)}
     changed = scene.sumocfg or scene.base
-    settings = {"scene_settings": plain(scene_settings(scene))} if changed else {}
+    settings = {"scene_settings": _recorded(scene_settings(scene))} if changed else {}
     return {"scene": scene.name, "scene_digest": scene.digest, **settings}
+
+
+def _recorded(settings: SceneSettings | SumocfgSettings) -> dict[str, Any]:
+    """Return settings for cards and runs; without what is newer they are those of earlier versions."""
+    return _without(plain(settings), {name: plain(getattr(SumocfgSettings, name)) for name in _NEWER})
 
 
 def read_described(card: Mapping[str, Any]) -> tuple[AnyScene, ...]:

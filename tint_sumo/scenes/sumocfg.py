@@ -21,6 +21,9 @@ from tint_sumo.config import (
     DistanceM,
     EgoControl,
     EgoController,
+    Penalty,
+    Perceivable,
+    RedLight,
     Slots,
     TimeS,
     VehicleShape,
@@ -68,11 +71,15 @@ class SumocfgScene:
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     controller: EgoController = field(default_factory=EgoController)
     ego_control: EgoControl = "speed"  # "sumo": SUMO's driver drives the ego, whatever the actions are
+    perceives: tuple[Perceivable, ...] = ()  # further keys of the observation, in the order of ``Perceivable``
+    red_light: RedLight = "ignore"  # follows from driving over a stop line at red: nothing, a cost, the episode's end
+    red_light_penalty: Penalty = 1.0  # is taken from the reward for each stop line driven over at red, with "cost"
 
     def __post_init__(self) -> None:
         require_ranges(self)
-        if self.ego_control not in get_args(EgoControl):
-            raise InputError(f"ego_control must be 'speed' or 'sumo', not {shown(self.ego_control)}")
+        for name, choices in (("ego_control", EgoControl), ("red_light", RedLight)):
+            _require_choice(name, getattr(self, name), choices)
+        object.__setattr__(self, "perceives", _in_order(self.perceives))
 
     @property
     def sumocfg(self) -> Path:
@@ -141,6 +148,9 @@ def from_sumocfg(
     vehicle: VehicleShape | None = None,
     controller: EgoController | None = None,
     ego_control: EgoControl = SumocfgScene.ego_control,
+    perceives: Sequence[Perceivable] = SumocfgScene.perceives,
+    red_light: RedLight = SumocfgScene.red_light,
+    red_light_penalty: float = SumocfgScene.red_light_penalty,
 ) -> SumocfgScene:
     """Return a scene of the configuration's network and demand.
 
@@ -160,6 +170,13 @@ def from_sumocfg(
         ego_control: "sumo" lets SUMO's driver of a default passenger car drive the ego, up to its highest desired
             speed and the speed limit, as a baseline on the same cases: it obeys traffic lights and the right of way,
             keeps its distance, and takes no notice of actions.
+        perceives: names of further keys of the observation, which ``tint_sumo.envs.SceneEnv`` describes:
+            "traffic_light", "speed_limit" and "lane".
+        red_light: what follows if the ego's front drives over a stop line while its signal is red. "ignore": nothing.
+            "cost": the step's ``info["cost"]`` is the number of such lines, and the reward is lower by
+            ``red_light_penalty`` for each. "end": the episode ends with the outcome ``red_light`` and the reward of a
+            collision.
+        red_light_penalty: taken from the reward for each such line with "cost".
 
     Raises:
         InputError: files are missing or of a newer SUMO, the route does not exist or is not connected, or the ego's
@@ -193,7 +210,29 @@ def from_sumocfg(
         vehicle=vehicle or VehicleShape(),
         controller=controller or EgoController(),
         ego_control=ego_control,
+        perceives=tuple(perceives),
+        red_light=red_light,
+        red_light_penalty=red_light_penalty,
     )
+
+
+def _require_choice(name: str, value: Any, choices: Any) -> None:
+    """Raise InputError unless a value is one of the words of a literal type."""
+    if value not in get_args(choices):
+        raise InputError(f"{name} must be one of {', '.join(get_args(choices))}, not {shown(value)}")
+
+
+def _in_order(perceives: Any) -> tuple[Perceivable, ...]:
+    """Return the names of keys in the order of ``Perceivable``.
+
+    Raises:
+        InputError: they are no names, or there is no such key.
+    """
+    if isinstance(perceives, str) or not isinstance(perceives, Sequence):
+        raise InputError(f"perceives must be names such as ('traffic_light', 'lane'), not {shown(perceives)}")
+    for name in perceives:
+        _require_choice("perceives", name, Perceivable)
+    return tuple(name for name in get_args(Perceivable) if name in perceives)
 
 
 def read_net(file: Path, *, with_internal: bool = True) -> Any:

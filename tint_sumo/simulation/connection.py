@@ -43,6 +43,7 @@ class Connection:
     edge: Any
     route: Any
     polygon: Any
+    trafficlight: Any
     simulation: Any
     lane_position_m: Callable[[str], float]  # vehicle.getLanePosition, which is called more often than all else
     step: Callable[..., Any]  # one step or, with a time, all steps until then
@@ -108,6 +109,7 @@ def _libsumo(options: Sequence[str]) -> Connection:
                 libsumo.edge,
                 libsumo.route,
                 libsumo.polygon,
+                libsumo.trafficlight,
                 libsumo.simulation,
                 lane_position_m,
                 libsumo.simulationStep,
@@ -160,6 +162,7 @@ def _traci(options: Sequence[str]) -> Connection:
                 connection.edge,
                 connection.route,
                 connection.polygon,
+                connection.trafficlight,
                 connection.simulation,
                 connection.vehicle.getLanePosition,
                 connection.simulationStep,

@@ -69,6 +69,7 @@ class Egos:
     ``collision``   R items the first collision in the episode, or None
     ``lost``        (R,)    SUMO has taken the ego off the road, or off its route
     ``hit_person``  (R,)    it has touched a person on foot in the episode
+    ``ran_red``     (R,)    it has driven over a stop line at red, where that ends the episode
     =============== ======= ======================================================================
     """
 
@@ -94,6 +95,7 @@ class Egos:
         self.collision: list[Collision | None] = [None] * replicas
         self.lost: Bools = np.zeros(replicas, bool)
         self.hit_person: Bools = np.zeros(replicas, bool)
+        self.ran_red: Bools = np.zeros(replicas, bool)
 
     @property
     def collided(self) -> Bools:
@@ -105,7 +107,8 @@ class Egos:
         self.front_m[replica] = self.speed_mps[replica] = 0.0
         self.box[replica] = self._nowhere[0]
         self.distance_m[replica] = self._was_distance_m[replica] = np.inf
-        self.unsafe[replica] = self.lost[replica] = self.hit_person[replica] = False
+        for flag in (self.unsafe, self.lost, self.hit_person, self.ran_red):
+            flag[replica] = False
         self._hit_slot[replica] = NO_VEHICLE
         self._was_number[replica] = NO_VEHICLE
         self.collision[replica] = None

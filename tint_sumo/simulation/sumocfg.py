@@ -24,6 +24,7 @@ from tint_sumo.simulation.bodies import LONG_M, Bodies, Body, box_of
 from tint_sumo.simulation.connection import Connection, connect
 from tint_sumo.simulation.ego import Collision
 from tint_sumo.simulation.ego_way import EGO, EgoWay, Fate
+from tint_sumo.simulation.perception import Perception
 from tint_sumo.simulation.persons import Persons
 from tint_sumo.simulation.refusals import Refusals
 from tint_sumo.simulation.simulation import Simulation
@@ -122,6 +123,7 @@ class SumocfgSimulation(Simulation):
         self._known_vtypes = 0
         self._any_long = False
         self.persons = Persons(scene, self.connection)
+        self.perception = Perception(scene, self.connection)
         self._drives = False
         self._accel_mps2 = 0.0  # of the ego, where SUMO drives it
         self.slot: dict[str, int] = {}
@@ -179,6 +181,7 @@ class SumocfgSimulation(Simulation):
         self.slot.clear()
         self._number.clear()
         self.persons.clear()
+        self.perception.clear()
         self._long.clear()
         self.origin_m = (0.0, 0.0)
 
@@ -241,6 +244,7 @@ class SumocfgSimulation(Simulation):
             InputError: SUMO finds fault with the demand.
         """
         if not self._drives:
+            self.perception.end(arrived=False)
             return
         with self._refusals:
             moved_m = self._drive(desired_speed_mps) * self.scene.step_s
@@ -250,6 +254,7 @@ class SumocfgSimulation(Simulation):
             self._look()
         else:
             self._end(fate)
+        self.egos.ran_red[0] |= self.scene.red_light == "end" and self.perception.lights.passed_red > 0
 
     def _drive(self, desired_speed_mps: Floats) -> float:
         """Choose the ego's speed in this step, if SUMO does not; return it, or the highest that SUMO may choose."""
@@ -263,6 +268,7 @@ class SumocfgSimulation(Simulation):
     def _end(self, fate: Fate) -> None:
         """Leave all as it was at last: the ego has come to its route's end, or SUMO has taken it away."""
         self._drives = False
+        self.perception.end(arrived=fate is Fate.ARRIVED)
         if fate is Fate.ARRIVED:
             self.egos.front_m[0] = np.inf
         else:
@@ -277,6 +283,7 @@ class SumocfgSimulation(Simulation):
         self.egos.front_m[0] = self.scene.start_m + ego[constants.VAR_DISTANCE]
         self.egos.speed_mps[0] = ego[constants.VAR_SPEED]
         self.egos.box[0] = box_of(ego, self._ego_size_m, self.origin_m)
+        self.perception.look(float(self.egos.front_m[0]))
         self.persons.follow(self.persons.take_from(seen), self.origin_m, ego[constants.VAR_POSITION3D][2])
         seen = self._in_sight(seen, ego[constants.VAR_POSITION3D])
         self._follow(seen if seen.keys() <= self.slot.keys() else self._nearest(seen, ego[constants.VAR_POSITION3D]))

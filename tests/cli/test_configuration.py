@@ -29,6 +29,7 @@ COMMAND_LINES = (
     "record --out s3://bucket/data --executor ray --address ray://head:10001",
     "dataset inspect data --figure picture.png --verify",
     "tracks inspect tracks.csv --format ngsim --figure tracks.png",
+    "drivers fit tracks --out fitted --model Krauss --min-duration 15 --step 0.2",
     "traits train --data data --out model --method morton --budget paper --noise 0.1",
     "traits evaluate --data data --model vae --noise 1e-3 --other-scene",
     "traits plot --data data --model vae --out pictures",

@@ -17,6 +17,7 @@ WRITING = {
     "record": "record --windows 20 --out OUT",
     "dataset inspect": "dataset inspect DATA --figure OUT",
     "tracks inspect": "tracks inspect DATA --figure OUT",
+    "drivers fit": "drivers fit DATA --out OUT",
     "traits train": "traits train --data DATA --out OUT",
     "traits plot": "traits plot --data DATA --model vae --out OUT",
     "traits infer": "traits infer --fcd DATA --model vae --out OUT",

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import lfilter
 
 from tint_sumo.core.files import write_text
 from tint_sumo.drivers.models import MODELS, Floats
@@ -25,6 +26,15 @@ def leader_speeds_mps(rows: int, seed: int, mean_mps: float = 20.0) -> Floats:
     return np.maximum((mean_mps + waves) * stop, 0.0)
 
 
+def wandering(rows: int, deviation_m: float, seed: int, time_s: float = 5.0) -> Floats:
+    """Errors of a recorded position that come and go in some seconds: an AR(1) process that begins at 0."""
+    rng = np.random.default_rng((seed, 1))
+    keeps = np.exp(-STEP_S / time_s)
+    innovations = rng.normal(0.0, deviation_m * np.sqrt(1.0 - keeps**2), rows)
+    innovations[0] = 0.0
+    return np.asarray(lfilter([1.0], [1.0, -keeps], innovations))
+
+
 def simulated_pair(
     log_parameters: Floats,
     seed: int = 0,
@@ -35,15 +45,13 @@ def simulated_pair(
     start_s: float = 0.0,
     mean_mps: float = 20.0,
 ) -> Pair:
-    """A follower with these parameters; its positions wander by about ``noise_m``, slowly."""
+    """A follower with these parameters; its positions err by ``noise_m``, see ``wandering``."""
     leader_speed_mps = leader_speeds_mps(rows, seed, mean_mps)
     leader_rear_m = 60.0 + np.cumsum(leader_speed_mps) * STEP_S
     front_m, speed_mps = MODELS[model].follow(
         leader_rear_m, leader_speed_mps, 20.0, leader_speed_mps[0], log_parameters, STEP_S
     )
-    rng = np.random.default_rng((seed, 1))
-    time_s = STEP_S * np.arange(rows)
-    wander_m = noise_m * sum(np.sin(time_s / scale + rng.uniform(0, 6.28)) for scale in (3.0, 8.0)) if noise_m else 0.0
+    wander_m = wandering(rows, noise_m, seed)
     return Pair(
         "1", follower, f"leader{seed}", start_s, STEP_S, leader_rear_m, leader_speed_mps, front_m + wander_m, speed_mps
     )

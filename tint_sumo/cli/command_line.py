@@ -17,6 +17,7 @@ from tint_sumo.cli.bench import Bench
 from tint_sumo.cli.command import Command, flag_of
 from tint_sumo.cli.configuration import commands_named, config_of, read_command, write_command
 from tint_sumo.cli.dataset import Dataset, Record
+from tint_sumo.cli.drivers import Drivers
 from tint_sumo.cli.models import Models
 from tint_sumo.cli.net import Net
 from tint_sumo.cli.policy import Policy
@@ -52,6 +53,7 @@ class TintSumo:
         | Annotated[Record, subcommand("record")]
         | Annotated[Dataset, subcommand("dataset")]
         | Annotated[Tracks, subcommand("tracks")]
+        | Annotated[Drivers, subcommand("drivers")]
         | Annotated[Traits, subcommand("traits")]
         | Annotated[Policy, subcommand("policy")]
         | Annotated[Study, subcommand("study")]

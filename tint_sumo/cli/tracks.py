@@ -16,6 +16,7 @@ _FORMAT = optional(
     "data with longitudes and latitudes.",
     "recognised by the file's beginning",
 )
+TrackFormatName = Annotated[str | None, _FORMAT]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +25,7 @@ class InspectTracks(Command):
 
     file: Positional[Path]
     """levelX, INTERACTION, NGSIM, TGSIM or leader-follower CSV, CommonRoad XML, or SUMO's floating-car data."""
-    format: Annotated[str | None, _FORMAT] = None
+    format: TrackFormatName = None
     figure: Annotated[Path | None, optional("FILE", "Picture to write: .png, .jpg, .webp, .svg or .pdf.")] = None
 
     def run(self) -> Outcome:

@@ -92,6 +92,16 @@ class Recorded:
         return tuple(dict.fromkeys(pair.driver for pair in self.pairs))
 
 
+def left_out_text(found: Recorded) -> list[str]:
+    """Return lines for people about what was left out."""
+    parts = [
+        (found.short, "pairs that are too short"),
+        (found.inconsistent, "tracks whose positions and speeds disagree"),
+        (len(found.unread), "files that are no tracks, such as " + "".join(file.name for file in found.unread[:1])),
+    ]
+    return [f"left out: {count:,} {what}" for count, what in parts if count]
+
+
 def read_pairs(
     path: Path, format_name: str | None = None, step_s: float = STEP_S, min_duration_s: float = MIN_DURATION_S
 ) -> Recorded:

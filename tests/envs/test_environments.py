@@ -158,7 +158,7 @@ def test_infos_contain_positions_on_routes_with_tracks(env: SceneEnv) -> None:
     assert not set(TRACKS) & env.reset(seed=5)[1].keys()
     env = SceneEnv(TaskSettings(tracks=True, backend="traci"))
     env.reset(seed=5)
-    simulation, passed = env._episodes.simulation, []
+    simulation, passed, claimed = env._episodes.simulation, [], []
     while True:
         observation, _, terminated, truncated, info = env.step(np.int64(GO))
         present, route = simulation.slots.present[0], simulation.slots.route[0]
@@ -167,11 +167,17 @@ def test_infos_contain_positions_on_routes_with_tracks(env: SceneEnv) -> None:
         assert_equal(info["gap_m"], np.where(leader >= 0, gap_m, np.inf))
         passed.append(observation["ego"][1] * 20.0 > 4.0)
         assert_equal(info["passed"], present & (route == LOWER) & passed[-1])
+        claims = simulation.yielding.has_claimed[0]
+        assert_equal(info["claimed"], present & claims[route])
+        to_stop_m = simulation.layout.zones.stop_line_m[route] - info["position_m"]
+        assert_equal(info["to_stop_m"], np.where(present, to_stop_m, np.inf))
+        claimed.append(bool(info["claimed"].any()))
         if terminated or truncated:
             break
     env.close()
     assert info["outcome"] == "success"
     assert not passed[0] and passed[-1]
+    assert not claimed[0] and any(claimed)
 
 
 def test_position_noise_has_its_standard_deviation_and_spares_the_ego() -> None:

@@ -28,7 +28,7 @@ GO, STOP = 2, 0
 
 @contextmanager
 def episodes(num_envs: int, **settings: Any) -> Iterator[Episodes]:
-    made = Episodes(num_envs, TaskSettings(**settings))
+    made = Episodes(num_envs, [TaskSettings(**settings)])
     try:
         yield made
     finally:
@@ -38,7 +38,14 @@ def episodes(num_envs: int, **settings: Any) -> Iterator[Episodes]:
 def test_without_settings_the_scene_is_as_it_is() -> None:
     assert TaskSettings().played == T == TaskSettings(scene=T).played
     assert TaskSettings().contents == Contents()
-    assert TaskSettings(tracks=True).contents.slot_infos == ("traits", "position_m", "gap_m", "passed")
+    assert TaskSettings(tracks=True).contents.slot_infos == (
+        "traits",
+        "position_m",
+        "gap_m",
+        "passed",
+        "claimed",
+        "to_stop_m",
+    )
 
 
 @pytest.mark.parametrize(
@@ -146,7 +153,7 @@ def test_noise_is_drawn_anew_in_every_step_and_episode() -> None:
                 assert len(np.unique(shown, axis=0)) == len(shown) > 1, "each vehicle has noise of its own"
                 for batch in (noisy, clear):
                     batch.step(np.array([STOP]))
-        assert not clear.sensing.noise_m.any()
+        assert not clear.sensing(0).noise_m.any()
     assert len(np.unique(np.round(drawn, 6), axis=0)) == 6
     assert np.abs(drawn).max() < 0.6 / 20.0
 

@@ -21,7 +21,7 @@ Make = Callable[[str], UserNetwork]
 def state(episodes: Episodes) -> dict[str, Any]:
     """Every array and list that has an entry per environment, and the generators of the noise."""
     simulation = episodes.simulation
-    parts = [simulation, simulation.slots, simulation.egos, episodes.sensing]
+    parts = [simulation, simulation.slots, simulation.egos, episodes.sensing(0)]
     parts += [getattr(simulation, name) for name in ("yielding", "_demand") if hasattr(simulation, name)]
     found = {
         f"{type(part).__name__}.{name}": value.tolist() if isinstance(value, np.ndarray) else list(value)
@@ -31,7 +31,7 @@ def state(episodes: Episodes) -> dict[str, Any]:
     }
     for objects in ("_streams", "_pools", "_towns"):
         found.pop(f"Demand.{objects}", None)
-    sensing = episodes.sensing
+    sensing = episodes.sensing(0)
     assert sensing._normals is not None
     noise = [rng and rng.bit_generator.state for rng in sensing._normals._generators]
     drawn = (sensing._normals._ahead.tolist(), sensing._normals._next.tolist())

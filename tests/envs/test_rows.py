@@ -34,7 +34,8 @@ from tint_sumo.envs.rows import (
     step_info,
 )
 from tint_sumo.scenes import find_scene
-from tint_sumo.scenes.geometry import BOX
+from tint_sumo.scenes.drivers import NO_TOWN
+from tint_sumo.scenes.geometry import BOX, Numbers
 
 RULES = TaskRules(goal_m=30.0, step_limit=100, goal=2.5, collision=-2.0, speed_weight_per_mps=0.05, step=-0.25)
 GOAL, BEYOND = 30.0, math.nextafter(30.0, math.inf)
@@ -201,20 +202,28 @@ def test_tracks_are_seen_with_the_noise_along_the_way() -> None:
     noise_m = np.array([[[0.5, 9.0], [1.0, 2.0], [-0.25, 0.0], [4.0, 4.0]]])
     front_m, gap_m = np.array([[10.0, 20.0, 30.0, 40.0]]), np.array([[3.0, 4.0, 0.0, 0.0]])
     leader = np.array([[1, 0, -1, -1]])
-    route, passed_m = np.array([[0, 1, 1, 0]]), np.array([5.0, 6.0])
-    source = np.where(present, np.arange(4), -1)
-    observe_tracks(np.array([6.0]), passed_m, source, route, vehicles, front_m, leader, gap_m, noise_m, rows)
+    route, passed_m, stop_line_m = np.array([[0, 1, 1, 0]]), np.array([5.0, 6.0]), np.array([12.0, np.inf])
+
+    def look(ego_front_m: float, source: Numbers) -> None:
+        ego, claims = np.array([ego_front_m]), np.array([[False, True]])
+        traffic = (source, route, vehicles, front_m, leader, gap_m, noise_m)
+        observe_tracks(ego, claims, passed_m, stop_line_m, *traffic, rows)
+
+    look(6.0, np.where(present, np.arange(4), -1))
     # Along their ways the noise is -0.5, 2.2, 0.25 and 5.6 m.
     np.testing.assert_allclose(rows["position_m"], [[9.5, 22.2, 30.25, 0.0]])
     np.testing.assert_allclose(rows["gap_m"], [[3.0 + 0.5 + 2.2, 4.0 - 2.2 - 0.5, np.inf, np.inf]])
     np.testing.assert_array_equal(rows["passed"], [[1, 0, 0, 0]])
-    observe_tracks(np.array([4.0]), passed_m, source, route, vehicles, front_m, leader, gap_m, noise_m, rows)
+    np.testing.assert_array_equal(rows["claimed"], [[0, 1, 1, 0]])
+    np.testing.assert_allclose(rows["to_stop_m"], [[2.5, np.inf, np.inf, np.inf]])
+    look(4.0, np.where(present, np.arange(4), -1))
     assert not rows["passed"].any()
-    source = np.array([[-1, 2, 0, -1]])
-    observe_tracks(np.array([6.0]), passed_m, source, route, vehicles, front_m, leader, gap_m, noise_m, rows)
+    look(6.0, np.array([[-1, 2, 0, -1]]))
     np.testing.assert_allclose(rows["position_m"], [[0.0, 30.25, 9.5, 0.0]])
     np.testing.assert_allclose(rows["gap_m"], [[np.inf, np.inf, 5.7, np.inf]])
     np.testing.assert_array_equal(rows["passed"], [[0, 0, 1, 0]])
+    np.testing.assert_array_equal(rows["claimed"], [[0, 1, 0, 0]])
+    np.testing.assert_allclose(rows["to_stop_m"], [[np.inf, np.inf, 2.5, np.inf]])
 
 
 def test_a_decision_s_rewards_are_summed_up_and_its_end_is_kept() -> None:
@@ -231,7 +240,7 @@ def test_a_decision_s_rewards_are_summed_up_and_its_end_is_kept() -> None:
 def test_infos_of_a_row() -> None:
     rows = np.zeros(2, row_type(2))
     rows["outcome"], rows["time_s"], rows["traits"], rows["goal"] = [0, 1], 0.3, [[1, -1], [0, 0]], 2.5
-    rows["town"] = -1
+    rows["town"] = NO_TOWN
     going_on, over = map(fields_of, rows)
     assert set(observation_of(going_on, Contents())) == {"ego", "vehicles", "mask"}
     begun = start_info(going_on, Contents(slot_infos=("traits", "passed")))

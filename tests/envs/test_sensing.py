@@ -34,7 +34,7 @@ ALL_EFFECTS = Sensor(
 
 @contextmanager
 def episodes(num_envs: int, sensor: Sensor, **task: Any) -> Iterator[Episodes]:
-    batch = Episodes(num_envs, TaskSettings(sensor=sensor, tracks=True, **task))
+    batch = Episodes(num_envs, [TaskSettings(sensor=sensor, tracks=True, **task)])
     try:
         yield batch
     finally:
@@ -106,7 +106,7 @@ def test_white_noise_is_drawn_step_by_step_from_the_second_stream_of_the_episode
         drawn = [np.random.default_rng([seed, 1]) for seed in seeds]
         for _ in range(40):
             for index, rng in enumerate(drawn):
-                np.testing.assert_array_equal(batch.sensing.noise_m[index], rng.normal(0.0, 0.1, (12, 2)))
+                np.testing.assert_array_equal(batch.sensing(0).noise_m[index], rng.normal(0.0, 0.1, (12, 2)))
             batch.step(np.array([STOP, CREEP]))
 
 
@@ -120,7 +120,7 @@ def test_a_perfect_sensor_shows_all_vehicles_in_their_slots() -> None:
             np.testing.assert_array_equal(rows["track"], slots.vehicle_number)
             np.testing.assert_array_equal(rows["slot"], np.where(slots.present, np.arange(12), -1))
             batch.step(np.array([STOP, GO]))
-        assert rows["mask"].sum() > 10 and not batch.sensing.noise_m.any()
+        assert rows["mask"].sum() > 10 and not batch.sensing(0).noise_m.any()
 
 
 class Street:
@@ -227,7 +227,7 @@ def test_all_that_is_observed_is_of_vehicles_that_are_seen(sensor: Sensor) -> No
     sensor = replace(sensor, noise_m=0.0, delay_s=0.0)
     hidden = missed = 0
     with episodes(3, sensor, p_conservative=(0.1, 0.9)) as batch:
-        simulation, sensing = batch.simulation, batch.sensing
+        simulation, sensing = batch.simulation, batch.sensing(0)
         for index in range(3):
             batch.begin(index, episode_seed(np.random.default_rng(index)))
         numbers: dict[tuple[int, int], int] = {}
@@ -308,7 +308,7 @@ def test_pictures_show_range_buildings_and_vehicles_that_are_not_seen() -> None:
             picture = env.render()
             assert picture is not None
             pictures.append(picture)
-            sensing = env._episodes.sensing
+            sensing = env._episodes.sensing(0)
             hidden = env.simulation.slots.present & ~sensing.seen
             traits = env.simulation.trait_of_member[env.simulation.slots.member[hidden]]
             expected = [trait in traits for trait in (0, 1)]

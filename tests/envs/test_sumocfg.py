@@ -125,7 +125,7 @@ def test_stable_baselines_has_them_too(user_network: Make) -> None:
         env.reset()
         for _ in range(20):
             env.step(np.array([2]))
-        assert set(env.slots) == {"traits", "position_m", "gap_m", "passed"}
+        assert set(env.slots) == {"traits", "position_m", "gap_m", "passed", "claimed", "to_stop_m"}
         env.env_method("park", indices=[0])
         env.step(np.array([2]))
     finally:

@@ -152,3 +152,25 @@ def test_only_an_episode_that_a_collision_ended_has_its_details(outcome: str) ->
         episodes.simulation.egos.collision[0] = Collision(0, 0, "lower", 1.0, 2.0)
         episodes.rows["outcome"] = OUTCOMES.index(outcome) + 1
         assert bool(episodes.collision_info(0)) is (outcome == "collision")
+
+
+def test_environments_whose_sensors_differ_share_a_simulation_and_are_as_they_are_alone() -> None:
+    sensors = ("perfect", "noisy_0.2", "range_15", "delay_0.2")
+    several = [TaskSettings(sensor=sensor, tracks=True) for sensor in sensors]
+    with closing(SceneVectorEnv(5, several)) as env:
+        assert isinstance(env.batch, LocalBatch)
+        assert len(set(env.tasks)) == 4 and env.tasks[3] == env.tasks[4]  # 1, 1, 1 and 2 environments
+        shown = [env.reset(seed=7)[0]]
+        shown += [env.step(np.array([2, 0, 0, 0, 0]))[0] for _ in range(60)]
+        snapshots = env.snapshot()
+    for index, sensor in enumerate((*sensors, sensors[-1])):
+        with closing(SceneEnv(TaskSettings(sensor=sensor))) as alone:
+            observations = [alone.reset(seed=7 + index)[0]]
+            observations += [alone.step(2 if index == 0 else 0)[0] for _ in range(30)]
+        for step, observation in enumerate(observations):
+            for key, value in observation.items():
+                np.testing.assert_array_equal(shown[step][key][index], value, err_msg=f"{sensor}, step {step}")
+    with closing(SceneVectorEnv(5, several)) as env:
+        observation, _ = env.restore(snapshots)
+        for key, value in observation.items():
+            np.testing.assert_array_equal(value, shown[-1][key])

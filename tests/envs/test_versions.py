@@ -72,7 +72,7 @@ def test_what_is_seen_of_the_t_intersection_is_that_of_its_version(noise_m: floa
             seen = (
                 *(observation[key] for key in ("ego", "vehicles", "mask")),
                 infos["traits"].astype(np.int8),  # labels had one byte in the beginning
-                *(infos[key] for key in TRACKS),
+                *(infos[key] for key in TRACKS[:3]),  # there were no others in the beginning
             )
             for values in seen:
                 found.update(np.ascontiguousarray(values).tobytes())

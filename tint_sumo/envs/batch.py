@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from tint_sumo.core.errors import InputError, shown
-from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings
+from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings, fingerprints
 from tint_sumo.envs.rows import Rows, outcome_name
 from tint_sumo.simulation.timing import StepPart, does
 
@@ -87,19 +87,23 @@ class Batch(Protocol):
 
 
 class LocalBatch:
-    """A batch in this process: replicas of one simulation."""
+    """A batch in this process: replicas of one simulation.
+
+    Environments are shared out among the settings, which differ in their sensors alone.
+    """
 
     def __init__(
-        self, num_envs: int, settings: TaskSettings, autoreset_mode: AutoresetMode, rows: Rows | None = None
+        self, num_envs: int, settings: Sequence[TaskSettings], autoreset_mode: AutoresetMode, rows: Rows | None = None
     ) -> None:
         self._autoreset_mode = autoreset_mode
         self.episodes = Episodes(num_envs, settings, rows)
         self.rows = self.episodes.rows
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._starts: list[EpisodeStart | None] = [None] * num_envs  # of the present episodes
-        self._settings = settings
+        self._settings = settings[0]
+        self._tasks = fingerprints(num_envs, settings)
         # The actions of the last decisions, (N,) each.
-        self._actions: deque[NDArray[np.integer]] = deque(maxlen=settings.decisions_per_episode + 1)
+        self._actions: deque[NDArray[np.integer]] = deque(maxlen=settings[0].decisions_per_episode + 1)
 
     def reset(self, seeds: Sequence[int | None], mask: NDArray[np.bool_]) -> None:
         for index in np.flatnonzero(mask).tolist():
@@ -146,8 +150,8 @@ class LocalBatch:
         decisions = -(-self.episodes.steps // self._settings.steps_per_decision)
         first = len(taken) - decisions  # of the present episodes
         return [
-            Snapshot(start.began, tuple(actions[begin:].tolist()), self._settings.fingerprint, start.number)
-            for start, actions, begin in zip(self._starts, taken.T, first.tolist(), strict=True)
+            Snapshot(start.began, tuple(actions[begin:].tolist()), task, start.number)
+            for start, actions, begin, task in zip(self._starts, taken.T, first.tolist(), self._tasks, strict=True)
             if start is not None  # as none is: all have been reset
         ]
 

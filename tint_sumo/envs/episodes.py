@@ -2,9 +2,10 @@
 
 import hashlib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -247,15 +248,37 @@ class EpisodeStart:
         return replace(before, seed=before.seed + 1, number=before.number + 1)
 
 
+def share_simulation(settings: Sequence[TaskSettings]) -> bool:
+    """Whether the environments of several settings can be in one simulation: they differ in their sensors alone."""
+    first, *others = settings
+    are_alike = all(
+        replace(task, sensor=first.sensor) == first and task.played == first.played and not task.scene.sumocfg
+        for task in others
+    )
+    return are_alike and len({task.sensor for task in settings}) == len(settings)
+
+
+def shares_of(num_envs: int, parts: int) -> list[slice]:
+    """Return which environments belong to which part: in order, and as evenly as can be."""
+    return [slice(*share) for share in pairwise(num_envs * part // parts for part in range(parts + 1))]
+
+
+def fingerprints(num_envs: int, settings: Sequence[TaskSettings]) -> list[str]:
+    """Return the fingerprint of each environment's settings."""
+    shares = shares_of(num_envs, len(settings))
+    return [task.fingerprint for task, share in zip(settings, shares, strict=True) for _ in range(num_envs)[share]]
+
+
 class Episodes:
     """``num_envs`` episodes at a time, each in its own replica with its own random stream.
 
     Args:
+        all_settings: settings among which the environments are shared out; they differ in their sensors alone.
         rows: (N,) written at each step; new if none are given.
     """
 
-    def __init__(self, num_envs: int, settings: TaskSettings, rows: Rows | None = None) -> None:
-        self.settings = settings
+    def __init__(self, num_envs: int, all_settings: Sequence[TaskSettings], rows: Rows | None = None) -> None:
+        settings = self.settings = all_settings[0]
         scene = settings.played
         self.simulation = make_simulation(num_envs, scene, settings.backend)
         self.rows = np.zeros(num_envs, settings.row_type) if rows is None else rows
@@ -267,8 +290,12 @@ class Episodes:
         self._steps_per_decision = settings.steps_per_decision
         self.steps = np.zeros(num_envs, np.int64)  # simulation steps since each episode's start
         self._parked: set[int] = set()
-        self._reveals = settings.sensor != PERFECT
-        self.sensing = Sensing(settings.sensor, self.simulation, scene.step_s)
+        self._reveals = any(task.sensor != PERFECT for task in all_settings)
+        shares = shares_of(num_envs, len(all_settings))
+        self._sensors = [
+            (share, Sensing(task.sensor, self.simulation, scene.step_s))
+            for share, task in zip(shares, all_settings, strict=True)
+        ]
         self._network: SumocfgSimulation | None = None  # the simulation of a scene whose rows have more fields
         if isinstance(self.simulation, SumocfgSimulation) and perceived_fields(scene):
             self._network = self.simulation
@@ -278,7 +305,7 @@ class Episodes:
         self.simulation.reset(index, seed)
         self._parked.discard(index)
         self._clear(index)
-        self.sensing.begin(index, seed)
+        self.sensing(index).begin(index, seed)
         self._observe(slice(index, index + 1))
 
     def park(self, index: int) -> None:
@@ -334,10 +361,20 @@ class Episodes:
             judge_red_lights(self._network, self._rules.collision, self.rows)
         return any_ended
 
+    def sensing(self, index: int) -> Sensing:
+        """Return the sensor of an environment."""
+        return next(sensing for share, sensing in self._sensors if index < share.stop)
+
     @does(StepPart.OBSERVATION)
     def _observe(self, envs: slice) -> None:
         """Write the observations of some environments, as their sensors have them."""
-        egos, slots, sensing, rows = self.simulation.egos, self.simulation.slots, self.sensing, self.rows[envs]
+        for share, sensing in self._sensors:
+            both = slice(max(envs.start, share.start), min(envs.stop, share.stop))
+            if both.start < both.stop:
+                self._observe_with(sensing, both)
+
+    def _observe_with(self, sensing: Sensing, envs: slice) -> None:
+        egos, slots, rows = self.simulation.egos, self.simulation.slots, self.rows[envs]
         traits = self._trait_of_member[slots.member[envs]]
         sensing.look(envs)
         observe(
@@ -355,17 +392,19 @@ class Episodes:
         if self._network is not None:
             observe_road(self._network, rows)
         if self.settings.tracks:
-            self._observe_tracks(envs)
+            self._observe_tracks(sensing, envs)
         if self._reveals:
             reveal(egos.box[envs], slots.present[envs], slots.box[envs], traits, self._scales, rows)
         sensing.delay(self.steps, envs, rows)
 
-    def _observe_tracks(self, envs: slice) -> None:
-        egos, slots, sensing = self.simulation.egos, self.simulation.slots, self.sensing
+    def _observe_tracks(self, sensing: Sensing, envs: slice) -> None:
+        egos, slots = self.simulation.egos, self.simulation.slots
         leader, gap_m = self.simulation.leaders(envs, sensing.seen[envs])
         observe_tracks(
             egos.front_m[envs],
+            self.simulation.claims[envs],
             self.simulation.passed_m,
+            self.simulation.stop_line_m,
             sensing.source[envs],
             slots.route[envs],
             slots.box[envs],
@@ -378,7 +417,8 @@ class Episodes:
 
     def render(self, index: int) -> NDArray[np.uint8]:
         """Draw an environment as an (H, W, 3) image, with what its sensor perceives."""
-        return render_scene(self.simulation, index, self.settings.sensor, self.sensing.seen[index])
+        sensing = self.sensing(index)
+        return render_scene(self.simulation, index, sensing.sensor, sensing.seen[index])
 
     def collision_info(self, index: int) -> dict[str, Any]:
         """Return whom the ego has hit, and where; empty if the episode has not ended with a collision."""

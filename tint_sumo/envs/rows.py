@@ -16,7 +16,7 @@ from tint_sumo.scenes.sumocfg import SumocfgScene
 
 Observation = dict[str, NDArray[np.float32]]
 OBSERVATION_KEYS = ("ego", "vehicles", "mask")
-TRACKS = ("position_m", "gap_m", "passed")  # per vehicle slot, if they are asked for
+TRACKS = ("position_m", "gap_m", "passed", "claimed", "to_stop_m")  # per vehicle slot, if they are asked for
 SEEN = ("vehicles", "mask", "traits", "track", "slot", *TRACKS)  # what the sensor says, and true traits that fit it
 TRUTH = ("track", "slot", "true_mask", "true_vehicles", "true_traits")  # per vehicle slot, if the sensor is not perfect
 SLOT_INFOS = ("traits", *TRACKS, *TRUTH)  # what infos can have for each vehicle slot
@@ -55,6 +55,8 @@ def row_type(max_vehicles: int, more: Sequence[tuple[str, Any, tuple[int, ...]]]
             ("position_m", np.float64, slots),  # along the route, as observed; 0 in empty slots
             ("gap_m", np.float64, slots),  # gap to the leader, as observed; infinite without one
             ("passed", np.int8, slots),  # 1 where the ego has left the vehicle's route behind
+            ("claimed", np.int8, slots),  # 1 where the ego claims the vehicle's route, see ``tint_sumo.config.Claim``
+            ("to_stop_m", np.float64, slots),  # to where it would wait for the ego, as observed; infinite if nowhere
             ("true_mask", np.int8, slots),  # of the simulation's slots, as they are: 1 where there is a vehicle
             ("true_vehicles", np.float32, (max_vehicles, 2)),
             ("true_traits", np.int16, slots),
@@ -304,7 +306,9 @@ def reveal(egos: Boxes, present: Bools, vehicles: Boxes, traits: NDArray[np.int1
 @compiled
 def observe_tracks(
     ego_front_m: Floats,
+    claims: Bools,
     passed_m: Floats,
+    stop_line_m: Floats,
     source: Numbers,
     route: Numbers,
     vehicles: Boxes,
@@ -318,7 +322,8 @@ def observe_tracks(
 
     Args:
         ego_front_m: (N,).
-        passed_m: (K,) see ``tint_sumo.scenes.layout.ConflictZones``.
+        claims: (N, K) which of the K routes each ego claims.
+        passed_m, stop_line_m: (K,) see ``tint_sumo.scenes.layout.ConflictZones``.
         source: (N, V) as in ``observe``.
         route, vehicles, front_m: (N, V) of the simulation's slots.
         leader, gap_m: (N, V) of the simulation's slots: the next vehicle ahead that is seen, and the gap to it.
@@ -328,12 +333,15 @@ def observe_tracks(
         row = rows[index]
         for slot in range(source.shape[1]):
             row.position_m[slot], row.gap_m[slot], row.passed[slot] = 0.0, math.inf, 0
+            row.claimed[slot], row.to_stop_m[slot] = 0, math.inf
             shown = source[index, slot]
             if shown < 0:
                 continue
             this, ahead = vehicles[index, shown], leader[index, shown]
             noise_along_m = noise_m[index, shown, 0] * this.heading_x + noise_m[index, shown, 1] * this.heading_y
             row.position_m[slot] = front_m[index, shown] + noise_along_m
+            row.to_stop_m[slot] = stop_line_m[route[index, shown]] - row.position_m[slot]
+            row.claimed[slot] = claims[index, route[index, shown]]
             if ahead >= 0:
                 other = vehicles[index, ahead]
                 row.gap_m[slot] = gap_m[index, shown] - noise_along_m
@@ -366,6 +374,8 @@ def show_earlier(rows: Rows, frames: Rows, steps: Numbers) -> None:
             row.position_m[slot] = earlier.position_m[slot]
             row.gap_m[slot] = earlier.gap_m[slot]
             row.passed[slot] = earlier.passed[slot]
+            row.claimed[slot] = earlier.claimed[slot]
+            row.to_stop_m[slot] = earlier.to_stop_m[slot]
 
 
 def copied(rows: Rows, slot_infos: Collection[str] = SLOT_INFOS) -> dict[str, NDArray[Any]]:

@@ -95,6 +95,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `position_m`   | with `tracks`: `(V,)` where each vehicle's front is seen on its route; 0 in empty slots     |
     | `gap_m`        | with `tracks`: `(V,)` the gap that is seen to the next vehicle ahead; infinite without one  |
     | `passed`       | with `tracks`: `(V,)` int8, 1 where the ego has left the vehicle's route behind             |
+    | `claimed`      | with `tracks`: `(V,)` int8, 1 where the ego claims the vehicle's route                      |
+    | `to_stop_m`    | with `tracks`: `(V,)` from each vehicle's front to where it would stop for the ego;         |
+    |                | negative past it, infinite where it never meets the ego                                     |
     | `track`,       | with a sensor: `(V,)` number of the track in the episode that the slot shows, and of the    |
     | `slot`         | simulation's slot with its vehicle; -1 in empty slots                                       |
     | `true_mask`,   | with a sensor: `(V,)` and `(V, 2)`, the simulation's slots as they are, seen or not, with   |
@@ -179,7 +182,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._contents = settings.contents
         self._settings = settings
         self._calls = Calls()
-        self._episodes = Episodes(1, settings)
+        self._episodes = Episodes(1, [settings])
         self._start: EpisodeStart | None = None  # of the present episode
         self._actions: list[int] = []
 
@@ -213,7 +216,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     def _episodes(self) -> Episodes:
         """The running simulation; started when it is needed in a copy, or after a call that was interrupted."""
         self._calls.require_open()
-        return Episodes(1, self._settings)
+        return Episodes(1, [self._settings])
 
     def _stop(self) -> None:
         """End the simulation, if one runs."""

@@ -35,7 +35,7 @@ class Sensing:
 
     def __init__(self, sensor: Sensor, simulation: Simulation, step_s: float) -> None:
         shape = simulation.slots.present.shape
-        self._sensor = sensor
+        self.sensor = sensor
         self._simulation = simulation
         self._sight = Sight.of(sensor)
         self._memory = Memory.of(sensor, step_s)
@@ -67,7 +67,7 @@ class Sensing:
 
     def look(self, envs: slice) -> None:
         """Perceive the present step in some environments."""
-        egos, slots, sensor = self._simulation.egos, self._simulation.slots, self._sensor
+        egos, slots, sensor = self._simulation.egos, self._simulation.slots, self.sensor
         present, number = slots.present[envs], slots.vehicle_number[envs]
         if self._normals:
             follow_noise(number, self._known[envs], *self._normals.ahead(envs), self._memory, self.noise_m[envs])

@@ -23,7 +23,7 @@ from tint_sumo.envs.calls import (
     checked_options,
     checked_seeds,
 )
-from tint_sumo.envs.episodes import TaskSettings, action_space
+from tint_sumo.envs.episodes import TaskSettings, action_space, fingerprints, share_simulation
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
 from tint_sumo.envs.rows import (
     GOING_ON,
@@ -35,7 +35,7 @@ from tint_sumo.envs.rows import (
     outcome_names,
     step_info,
 )
-from tint_sumo.envs.workers import WorkerBatch, shares_of
+from tint_sumo.envs.workers import WorkerBatch
 from tint_sumo.scenes.drivers import NO_TOWN
 
 MOST_ENVS = 100_000  # environments of one vector; memory would not do for more
@@ -55,7 +55,8 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     with ``reset(options={"reset_mask": mask})``, whose mask (N,) is true for the environments to reset.
 
     ``settings`` may also be several, as for several scenes: the environments are shared out among them, in order and as
-    evenly as can be, and each has a process for itself. ``gymnasium.make_vec`` takes a list of scenes instead.
+    evenly as can be. Settings that differ in their sensors alone share one simulation; otherwise, each has a process
+    for itself. ``gymnasium.make_vec`` takes a list of scenes instead.
 
     With ``workers`` above 1 the environments are shared out among as many processes, with the same results; a script
     that asks for them needs the usual ``if __name__ == "__main__":``. This process is one of them, unless another
@@ -88,13 +89,13 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         first = settings[0]
         if len({task.played.max_vehicles for task in settings}) > 1:
             raise InputError("scenes of one environment must observe the same number of vehicles; change max_vehicles")
-        if len({task.contents for task in settings}) > 1:
+        if len({task.contents._replace(slot_infos=()) for task in settings}) > 1:
             raise InputError("scenes of one environment must have the same `perceives` and `red_light`; change them")
         self._mode = _autoreset_mode(autoreset_mode)
         fps = render_fps(first.decision_s)
         self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
         self.num_envs = num_envs
-        self.contents = first.contents
+        self.contents = max((task.contents for task in settings), key=lambda contents: len(contents.slot_infos))
         self.render_mode = render_mode
         self.single_observation_space = first.observation_space
         self.single_action_space: spaces.Discrete = action_space(first.played)
@@ -106,8 +107,8 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _make_batch(self) -> Batch:
         settings = self._settings
-        if len(settings) == 1:
-            return LocalBatch(self.num_envs, settings[0], self._mode)
+        if share_simulation(settings):
+            return LocalBatch(self.num_envs, settings, self._mode)
         return WorkerBatch(self.num_envs, settings, self._mode)
 
     @cached_property
@@ -182,12 +183,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     @property
     def tasks(self) -> list[str]:
         """Fingerprint of each environment's settings, which its snapshots have, too."""
-        shares = shares_of(self.num_envs, len(self._settings))
-        return [
-            settings.fingerprint
-            for settings, share in zip(self._settings, shares, strict=True)
-            for _ in range(share.start, share.stop)
-        ]
+        return fingerprints(self.num_envs, self._settings)
 
     def snapshot(self) -> list[Snapshot]:
         """Return what ``restore`` needs to come back to these steps of the episodes; it can be pickled.

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
 from typing import Any
@@ -22,18 +21,13 @@ from numpy.typing import NDArray
 
 from tint_sumo.core.processes import result_of, start_worker, value_of
 from tint_sumo.envs.batch import Ended, LocalBatch, Snapshot
-from tint_sumo.envs.episodes import TaskSettings
+from tint_sumo.envs.episodes import TaskSettings, shares_of
 from tint_sumo.envs.rows import Rows
 from tint_sumo.simulation.connection import libsumo_is_free
 
 _ENDING_S = 10.0  # more than enough for a step, and to close a simulation
 _POLL_S = 1e-3  # about the time of a step; sleeping and waking up would cost a large part of it
 _INTEGER = np.dtype(np.int64)
-
-
-def shares_of(num_envs: int, workers: int) -> list[slice]:
-    """Return which environments are in which process: in order, and as evenly as can be."""
-    return [slice(*share) for share in pairwise(num_envs * worker // workers for worker in range(workers + 1))]
 
 
 class WorkerBatch:
@@ -57,7 +51,8 @@ class WorkerBatch:
             for worker in range(int(takes_part), workers):
                 self._helpers.append(_start(worker, shared, self._shares[worker], settings[worker], autoreset_mode))
             if takes_part:
-                self._local = LocalBatch(self._shares[0].stop, settings[0], autoreset_mode, self.rows[self._shares[0]])
+                rows = self.rows[self._shares[0]]
+                self._local = LocalBatch(self._shares[0].stop, settings[:1], autoreset_mode, rows)
             self._listen()
         except BaseException:
             self.close()
@@ -206,7 +201,7 @@ def _serve(
     """Run a worker process."""
     line = _Line(pipe, shared.sent[worker, ::-1])
     with suppress(EOFError, ConnectionError):  # the other end is closed
-        make_batch = partial(LocalBatch, share.stop - share.start, settings, autoreset_mode, shared.rows[share])
+        make_batch = partial(LocalBatch, share.stop - share.start, [settings], autoreset_mode, shared.rows[share])
         line.send(result_of(lambda: _answer_requests(line, make_batch)))
 
 

@@ -149,7 +149,7 @@ class _Recorder:
                 ego_brakes=ego_brakes,
                 is_held=bool(egos.unsafe[0]),
                 present=slots.present[0].copy(),
-                seen=self._episodes.sensing.seen[0].copy(),
+                seen=self._episodes.sensing(0).seen[0].copy(),
                 vehicles=slots.vehicle_number[0].copy(),
                 boxes=slots.box[0].copy(),
                 bodies=simulation.bodies,

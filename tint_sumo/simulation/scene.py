@@ -48,13 +48,14 @@ class SceneSimulation(Simulation):
         self.population = members(scene.population)
         profiles = scene.population.profiles
         self.trait_of_member = np.array([profiles.index(member.profile) for member in self.population])
-        self.passed_m = self.layout.zones.passed_m
+        self.passed_m, self.stop_line_m = self.layout.zones.passed_m, self.layout.zones.stop_line_m
         self._build(scene.buildings)
         self._with_ego = with_ego
         self.link = SumoLink(self.layout, replicas, backend, collision_options)
         self.connection = self.link.connection
         self.lanes = LanePositions(self.layout, self.slots)
         self.yielding = Yielding(self.population, self.layout, self.slots, self.link)
+        self.claims = self.yielding.has_claimed
         self._demand = Demand(replicas, self.population, self.layout)
         self.time_s: Floats = np.zeros(replicas)
         self.vehicle_count = [0] * replicas  # vehicles that have appeared in each replica's episode

@@ -27,6 +27,8 @@ class Simulation(ABC):
     connection: Connection
     trait_of_member: Numbers  # number of the trait of each member of the population
     passed_m: Floats  # (K,) front of an ego that has left each route of the traffic behind
+    stop_line_m: Floats  # (K,) where vehicles on each route would wait for the ego; infinite if nowhere
+    claims: Bools  # (R, K) which routes each ego claims
     buildings: tuple[Building, ...] = ()  # in the scene's frame
     walls: Floats = np.zeros((0, 4))  # theirs, as ``tint_sumo.scenes.sight.walls_of`` returns them
     origin_m = (0.0, 0.0)  # position of the scene's origin in the network

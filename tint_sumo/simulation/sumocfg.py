@@ -112,7 +112,8 @@ class SumocfgSimulation(Simulation):
         self.trait_of_member = np.arange(len(scene.vtypes))
         self._refusals = Refusals(scene.config)
         self._ego_size_m = (scene.vehicle.length_m, scene.vehicle.width_m)
-        self.passed_m = np.array([np.inf])  # no vehicle's way is ever left behind
+        self.passed_m = self.stop_line_m = np.array([np.inf])  # no way is ever left behind, and none is waited at
+        self.claims = np.zeros((replicas, 1), bool)
         with self._refusals:
             self._run = SumocfgRun(scene.config)
             self.connection = connect(self._run.options(seed=0), backend)

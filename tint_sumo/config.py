@@ -5,6 +5,7 @@ Sources: "paper" is Liu et al., Learning to Navigate Intersections with Unsuperv
 """
 
 import re
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -139,6 +140,19 @@ class Idm:
 
 
 @dataclass(frozen=True)
+class FittedDriver:
+    """How a recorded driver follows: parameters of a car-following model that were fitted together."""
+
+    tau_s: TauS
+    min_gap_m: DistanceM
+    accel_mps2: AccelMps2
+    decel_mps2: AccelMps2
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+
+@dataclass(frozen=True)
 class Towns:
     """Towns that drivers are drawn from: each episode is in one of them.
 
@@ -210,6 +224,9 @@ class Population:
     idm: Idm = Idm()
     towns: Towns | None = None  # the members are those of each town then
     car_following: Literal["IDM", "EIDM", "Krauss", "ACC", "CACC"] = "IDM"  # SUMO's model, with the values of ``idm``
+    fitted: Many[
+        FittedDriver
+    ] = ()  # the members of each profile follow as these, in turn; () as ``idm`` and profiles say
 
     def __post_init__(self) -> None:
         names = [profile.name for profile in self.profiles]
@@ -223,6 +240,14 @@ class Population:
                 f"decel_mps2 of towns must not exceed emergency_decel_mps2 ({self.idm.emergency_decel_mps2:g}), "
                 f"{self.towns.decel_mps2[1]:g} does"
             )
+        if self.fitted and self.towns is not None:
+            raise InputError("fitted drivers are in no towns; leave out fitted, or towns")
+        for driver in self.fitted:
+            if driver.decel_mps2 > self.idm.emergency_decel_mps2:
+                raise InputError(
+                    f"decel_mps2 of fitted drivers must not exceed emergency_decel_mps2 "
+                    f"({self.idm.emergency_decel_mps2:g}), {driver.decel_mps2:g} does"
+                )
         towns = 1 if self.towns is None else len(self.towns.numbers)
         vtypes = towns * sum(max(1, round(self.members * profile.weight)) for profile in self.profiles)
         if vtypes > MOST_VTYPES:
@@ -237,12 +262,22 @@ class Population:
     @property
     def least_tau_s(self) -> float:
         """Shortest time headway that a driver can have."""
+        if self.fitted:
+            return min(driver.tau_s for driver in self.fitted)
         return self.idm.tau_s if self.towns is None else self.towns.least_tau_s
+
+    @property
+    def middle_tau_s(self) -> float:
+        """Time headway in the middle: the median of fitted drivers; with towns, the middle of their range."""
+        if self.fitted:
+            return statistics.median(driver.tau_s for driver in self.fitted)
+        return self.idm.tau_s if self.towns is None else sum(self.towns.tau_s) / 2
 
     def with_tau(self, tau_s: float) -> "Population":
         """Return the population with this time headway for everybody, in every town."""
         towns = self.towns and replace(self.towns, tau_s=(tau_s, tau_s), tau_shift_s=(0.0, 0.0))
-        return replace(self, idm=replace(self.idm, tau_s=tau_s), towns=towns)
+        fitted = tuple(replace(driver, tau_s=tau_s) for driver in self.fitted)
+        return replace(self, idm=replace(self.idm, tau_s=tau_s), towns=towns, fitted=fitted)
 
 
 _TOWNS = Population(members=8, towns=Towns())

@@ -12,6 +12,8 @@ from tint_sumo.config import (
     POPULATIONS,
     TOWN_LEVELS,
     TOWN_SHIFTS,
+    FittedDriver,
+    Idm,
     Population,
     Towns,
     VehicleShape,
@@ -80,6 +82,39 @@ def test_profiles_are_drawn_by_their_weights_in_plain_sumo_and_in_the_environmen
     drawn = Counter(names[stream.take().member] for _ in range(4000))
     for name, share in shares.items():
         assert drawn[name] / 4000 == pytest.approx(share, abs=0.03)
+
+
+FITTED = (FittedDriver(0.7, 2.1, 1.4, 1.9), FittedDriver(1.6, 3.2, 0.9, 2.8), FittedDriver(1.1, 2.5, 1.1, 1.5))
+
+
+def test_members_follow_as_fitted_drivers_in_turn_and_keep_all_else() -> None:
+    usual = members(Population(members=4))
+    found = members(Population(members=4, fitted=FITTED))
+    for turn, member, other in zip((0, 1, 2, 0) * 2, found, usual, strict=True):
+        driver, idm = FITTED[turn], member.idm
+        assert FittedDriver(idm.tau_s, member.min_gap_m, idm.accel_mps2, idm.decel_mps2) == driver
+        assert replace(member, idm=other.idm, min_gap_m=other.min_gap_m) == other
+    xml = vtypes_xml(Population(members=4, fitted=FITTED), 0.3, VehicleShape())
+    assert 'minGap="3.2" accel="0.9" decel="2.8" emergencyDecel="9" tau="1.6"' in xml
+
+
+def test_fitted_drivers_have_their_headways_or_all_the_same() -> None:
+    population = Population(fitted=FITTED)
+    assert (population.least_tau_s, population.middle_tau_s) == (0.7, 1.1)
+    assert {member.idm.tau_s for member in members(population.with_tau(1.5))} == {1.5}
+    assert members(population.with_tau(1.5))[1].min_gap_m == 3.2
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"towns": Towns()}, "fitted drivers are in no towns"),
+        ({"idm": Idm(emergency_decel_mps2=2.5)}, "must not exceed emergency_decel_mps2 .2.5., 2.8 does"),
+    ],
+)
+def test_fitted_drivers_that_do_not_fit_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Population(fitted=FITTED, **changes)
 
 
 TOWNS = Towns(count=400)

@@ -161,17 +161,30 @@ def _count(population: Population, profile: DriverProfile) -> int:
 def _members(population: Population) -> tuple[DriverMember, ...]:
     gaps, speeds = (np.random.default_rng(seed) for seed in (population.seed, (population.seed, 1)))
     return tuple(
-        DriverMember(
-            type_id=f"{profile.name}.{index}",
-            profile=profile,
-            desired_speed_mps=round(float(speeds.uniform(*profile.desired_speed_mps)), 4),
-            min_gap_m=round(float(gaps.uniform(*profile.min_gap_m)), 4),
-            idm=population.idm,
-            entry_gap_m=profile.entry_gap_m,
+        _as_fitted(
+            population,
+            index,
+            DriverMember(
+                type_id=f"{profile.name}.{index}",
+                profile=profile,
+                desired_speed_mps=round(float(speeds.uniform(*profile.desired_speed_mps)), 4),
+                min_gap_m=round(float(gaps.uniform(*profile.min_gap_m)), 4),
+                idm=population.idm,
+                entry_gap_m=profile.entry_gap_m,
+            ),
         )
         for profile in population.profiles
         for index in range(_count(population, profile))
     )
+
+
+def _as_fitted(population: Population, index: int, member: DriverMember) -> DriverMember:
+    """Return a member that follows as the fitted driver whose turn it is, if there are any."""
+    if not population.fitted:
+        return member
+    found = population.fitted[index % len(population.fitted)]
+    idm = replace(member.idm, tau_s=found.tau_s, accel_mps2=found.accel_mps2, decel_mps2=found.decel_mps2)
+    return replace(member, idm=idm, min_gap_m=found.min_gap_m)
 
 
 def vtypes_xml(population: Population, p_conservative: float, vehicle: VehicleShape) -> str:

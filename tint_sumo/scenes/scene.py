@@ -130,9 +130,8 @@ class Scene:
 
     @property
     def tau_s(self) -> float:
-        """Time headway of the drivers; with towns, of the one in the middle of their range."""
-        towns = self.population.towns
-        return self.population.idm.tau_s if towns is None else sum(towns.tau_s) / 2
+        """Time headway of the drivers, or the one in the middle where they differ in it."""
+        return self.population.middle_tau_s
 
     @property
     def speed_limit_mps(self) -> float:

@@ -42,7 +42,7 @@ def test_a_policy_is_trained_and_evaluated_in_a_configuration(
     assert "needs perceives of traffic_light, lane, and scene merge has nothing" in refused
     found = run(capsys, "policy", "evaluate", "--model", out, "--episodes", 1)
     assert (found["scene"], found["timeout"]) == ("merge", 1.0)
-    for rule in ("always_go", "ttc"):
+    for rule in ("always_go", "ttc", "sumo"):
         assert run(capsys, "policy", "evaluate", "--model", rule, *network, "--episodes", 1)["timeout"] == 1.0
 
 

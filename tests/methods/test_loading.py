@@ -1,6 +1,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,9 @@ import numpy as np
 import pytest
 
 from tests.bombs import BOMBS, bomb
+from tests.scenes.networks import lights
 from tint_sumo import traits
-from tint_sumo.config import ALL_MIXES, SENSORS, Mix, PpoSettings
+from tint_sumo.config import ALL_MIXES, SENSORS, EgoController, Mix, PpoSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
 from tint_sumo.methods import loading
@@ -76,6 +78,24 @@ def test_rules_by_name() -> None:
     venv.close()
 
 
+def test_rules_drive_in_sumo_configurations_with_any_desired_speeds_and_sumo_s_driver_obeys_lights(
+    tmp_path: Path,
+) -> None:
+    controller = EgoController((0.0, 4.0, 8.0, 11.0))
+    scene = lights(tmp_path, 0.5).scene(controller=controller, red_light="end", warm_up_s=5.0, time_limit_s=120.0)
+    found = {}
+    for name in ("always_go", "ttc", "sumo"):
+        contender = load_policy(name, scene=scene)
+        make_venv = partial(contender.make_venv, task=contender.task)
+        found[name] = evaluate(contender.policy, make_venv, 4, 0, batch=1)
+    assert found["sumo"].rate("success").value == 1.0
+    for name in ("always_go", "ttc"):
+        assert found[name].rate("red_light").value > 0.0
+        assert found[name].outcomes == ("success", "timeout", "collision", "red_light")
+    assert "give a .sumocfg as the scene" in refused("sumo")
+    assert "give a .sumocfg as the scene" in refused("sumo", scene="on_ramp")
+
+
 @pytest.mark.parametrize("path", [".", "policy.safetensors", "policy", "policy-25", "policy-50.safetensors"])
 def test_trained_policies_by_folder_and_by_file(run: Path, path: str) -> None:
     contender = load_policy(run / path)
@@ -115,7 +135,7 @@ def test_shipped_policies_by_name(shelf: Path) -> None:
 
 
 def test_unknown_names_are_answered_with_the_known_ones(shelf: Path, tmp_path: Path) -> None:
-    advice = "give always_go, ttc, no_labels, vae, the folder of a training run or a .safetensors file"
+    advice = "give always_go, ttc, sumo, no_labels, vae, the folder of a training run or a .safetensors file"
     assert refused("nobody") == f"no policy nobody; {advice}"
     assert refused(tmp_path).endswith(advice)
     assert refused("oracle").endswith(advice), "a method that nobody has shipped"

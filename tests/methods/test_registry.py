@@ -1,10 +1,13 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.scenes.networks import UserNetwork
 from tint_sumo import traits
 from tint_sumo.config import LATENT_SIZE, TraitSettings
 from tint_sumo.core.errors import InputError
@@ -14,6 +17,7 @@ from tint_sumo.methods.registry import (
     Look,
     Rule,
     always_go,
+    built_in_methods,
     find_learned,
     find_method,
     learned_methods,
@@ -37,9 +41,10 @@ def some_encoder(method: Learned) -> TraitModel | None:
 
 
 def test_rules_come_first_and_the_oracle_last() -> None:
-    assert list(METHODS)[:3] == ["always_go", "ttc", "no_labels"]
+    assert list(METHODS)[:4] == ["always_go", "ttc", "sumo", "no_labels"]
     assert list(METHODS)[-1] == "oracle"
-    assert set(METHODS) - set(LEARNED) == {"always_go", "ttc"}
+    assert set(METHODS) - set(LEARNED) == {"always_go", "ttc", "sumo"}
+    assert set(METHODS) - set(built_in_methods()) == {"sumo"}
 
 
 def test_names_and_titles_belong_to_one_method_each() -> None:
@@ -93,6 +98,16 @@ def test_rules_act() -> None:
         if isinstance(method, Rule):
             actions, _ = method.make(paper_scene()).predict(observation)
             assert actions.shape == (3,)
+
+
+def test_sumo_s_driver_is_a_rule_that_gives_the_ego_to_sumo(user_network: Callable[[str], UserNetwork]) -> None:
+    rule, scene = find_method("sumo"), user_network("merge").scene()
+    assert isinstance(rule, Rule)
+    assert rule.scene_for(scene) == replace(scene, ego_control="sumo")
+    with pytest.raises(InputError, match=r"method sumo drives in SUMO configurations alone; give a .sumocfg"):
+        rule.scene_for(paper_scene())
+    other = find_method("ttc")
+    assert isinstance(other, Rule) and other.scene_for(scene) is scene
 
 
 # Linear RGB as people see it without red cones, and without green ones (Machado, Oliveira and Fernandes 2009).
@@ -154,7 +169,9 @@ def test_a_new_method_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_unknown_methods_are_answered_with_the_known_ones() -> None:
-    with pytest.raises(InputError, match="unknown method 'magic'; choose one of: always_go, ttc, no_labels, morton"):
+    with pytest.raises(
+        InputError, match="unknown method 'magic'; choose one of: always_go, ttc, sumo, no_labels, morton"
+    ):
         find_method("magic")
 
 

@@ -102,8 +102,9 @@ TestData = Annotated[
 PolicyName = Annotated[
     str,
     arg(
-        help="Policy: a shipped one by its method (streaming, oracle, ...), a rule (always_go, ttc), the folder of a "
-        "training, the path of a .safetensors file, or with --allow-pickle of a .zip file."
+        help="Policy: a shipped one by its method (streaming, oracle, ...), a rule (always_go, ttc; in a SUMO "
+        "configuration also sumo, its own driver), the folder of a training, the path of a .safetensors file, or with "
+        "--allow-pickle of a .zip file."
     ),
 ]
 TestMix = Annotated[

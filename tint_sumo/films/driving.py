@@ -19,6 +19,7 @@ from tint_sumo.policy.trait_sources import Observation, OracleTraits, one_hot
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
 from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.scene import Building
+from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation import SceneSimulation, Simulation
 
 _BRAKING_MPS2 = 0.5  # vehicles that slow down by more than this show it
@@ -44,7 +45,7 @@ class Moment:
     observed_traits: Floats | None  # (V, Z) traits in the policy's observation; None where it has none
     attention: Floats | None  # (V,)
     claimed: Bools  # (K,); of no routes in a SUMO configuration
-    desired_mps: float | None  # the policy's action; None before its first
+    desired_mps: float | None  # the policy's action; None before its first, and where SUMO's driver drives
     value: float | None  # return that the policy expected when it chose the action
     outcome: str  # empty until the end
 
@@ -115,7 +116,9 @@ class _Recorder:
         actions, state = self._policy.predict(
             observation, state=state, episode_start=episode_start, deterministic=deterministic
         )
-        self._desired_mps = self._simulation.scene.ego.controller.desired_speeds_mps[int(actions[0])]
+        scene = self._simulation.scene
+        if not isinstance(scene, SumocfgScene) or scene.ego_control == "speed":
+            self._desired_mps = scene.ego.controller.desired_speeds_mps[int(actions[0])]
         return actions, state
 
     @torch.no_grad()

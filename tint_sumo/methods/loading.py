@@ -86,7 +86,7 @@ def load_policy(
     given = None if scene is None else find_scene(scene)
     method = METHODS.get(str(name_or_path))
     if isinstance(method, Rule):
-        chosen = given or paper_scene()
+        chosen = method.scene_for(given or paper_scene())
         return _in_scene(Contender(method.name, method.make(chosen), chosen, method=method.name), chosen)
     if Path(name_or_path).suffix == ".zip":
         stem = Path(name_or_path).with_suffix("")
@@ -110,14 +110,15 @@ def _in_scene(contender: Contender, scene: AnyScene) -> Contender:
         InputError: the scene has other numbers of observed vehicles or of actions, or other keys in its observations.
     """
     network: Any = contender.policy
-    is_rule = contender.source is None
+    is_rule, speeds = contender.source is None, len(scene.ego.controller.desired_speeds_mps)
     vehicles = scene.max_vehicles if is_rule else network.observation_space["vehicles"].shape[0]
-    actions = RULE_ACTIONS if is_rule else network.action_space.n
     perceives = scene.perceives if isinstance(scene, SumocfgScene) else ()
     needed = perceives if is_rule else perceived_in(network.observation_space.spaces)
+    of_rules = speeds if isinstance(scene, SumocfgScene) else RULE_ACTIONS
+    actions = of_rules if is_rule else network.action_space.n
     for what, wanted, there in (
         ("max_vehicles", vehicles, scene.max_vehicles),
-        ("desired_speeds_mps", actions, len(scene.ego.controller.desired_speeds_mps)),
+        ("desired_speeds_mps", actions, speeds),
         ("perceives", ", ".join(needed) or "nothing", ", ".join(perceives) or "nothing"),
     ):
         if wanted != there:

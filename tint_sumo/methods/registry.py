@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.config import PpoSettings
+from tint_sumo.config import EgoControl, PpoSettings
 from tint_sumo.core.errors import InputError, find_named
 
 if TYPE_CHECKING:
@@ -56,6 +56,21 @@ class Rule:
     title: str  # name in tables and figures
     make: "Callable[[AnyScene], Policy]"
     look: Look = Look()
+    ego_control: EgoControl = "speed"  # "sumo": SUMO's driver drives the ego, in SUMO configurations alone
+
+    def scene_for(self, scene: "AnyScene") -> "AnyScene":
+        """Return a scene with this rule's driver of the ego.
+
+        Raises:
+            InputError: that is SUMO's driver, and the scene is a built-in one.
+        """
+        from tint_sumo.scenes import SumocfgScene
+
+        if self.ego_control == "speed":
+            return scene
+        if not isinstance(scene, SumocfgScene):
+            raise InputError(f"method {self.name} drives in SUMO configurations alone; give a .sumocfg as the scene")
+        return replace(scene, ego_control=self.ego_control)
 
 
 @dataclass(frozen=True)
@@ -138,6 +153,11 @@ def learned_methods() -> tuple[str, ...]:
     return tuple(name for name, method in METHODS.items() if isinstance(method, Learned))
 
 
+def built_in_methods() -> tuple[str, ...]:
+    """Return the names of all methods that can drive in built-in scenes."""
+    return tuple(name for name, one in METHODS.items() if isinstance(one, Learned) or one.ego_control == "speed")
+
+
 def needed_encoders() -> tuple[str, ...]:
     """Return the names of the trait methods whose models the learned methods need, each of them once."""
     encoders = (method.encoder for method in METHODS.values() if isinstance(method, Learned))
@@ -165,10 +185,10 @@ def look_of_encoder(name: str) -> Look:
 # Rules and trait sources by the modules that hold them.
 
 
-def always_go(_: "AnyScene") -> Policy:
+def always_go(scene: "AnyScene") -> Policy:
     from tint_sumo.methods.rules import AlwaysGo
 
-    return AlwaysGo()
+    return AlwaysGo(len(scene.ego.controller.desired_speeds_mps) - 1)
 
 
 def time_to_collision(scene: "AnyScene") -> Policy:
@@ -211,6 +231,7 @@ def true_traits() -> "TraitSource":
 
 register(Rule("always_go", "always go", always_go, look=Look("#5444fd", "o", ":")))
 register(Rule("ttc", "time to collision", time_to_collision, look=Look("#8f9047", "s", ":")))
+register(Rule("sumo", "SUMO's driver", always_go, look=Look("#f524f0", "p", ":"), ego_control="sumo"))
 register(Learned("no_labels", "no labels", no_traits, look=Look("#1793fc", "D", "-")))
 register(Learned("morton", "Morton", window_traits, encoder="morton", look=Look("#d77e0b", "^", "--")))
 register(Learned("vae", "paper's method", window_traits, encoder="vae", look=Look("#197847", "v", "-")))

@@ -18,8 +18,11 @@ STOP, CREEP, GO = 0, 1, 2  # actions: desired speeds of 0, 0.5 and 3 m/s in the 
 ACTIONS = 3
 
 
+@dataclass(frozen=True)
 class AlwaysGo:
     """Drives at full speed whatever comes."""
+
+    action: int = GO  # number of the highest desired speed
 
     def predict(
         self,
@@ -29,7 +32,7 @@ class AlwaysGo:
         deterministic: bool = True,  # noqa: ARG002
     ) -> tuple[NDArray[np.int64], State | None]:
         """Return actions (N,) for N observations; arguments and result as in Stable-Baselines3's ``predict``."""
-        return np.full(len(observation["ego"]), GO), state
+        return np.full(len(observation["ego"]), self.action), state
 
 
 @dataclass(frozen=True)

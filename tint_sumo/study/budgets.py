@@ -22,7 +22,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import Range, require_distinct, require_ranges, set_floats
 from tint_sumo.core.structures import Many
 from tint_sumo.envs import TaskSettings
-from tint_sumo.methods.registry import METHODS
+from tint_sumo.methods.registry import built_in_methods
 from tint_sumo.scenes import AnyScene
 
 
@@ -123,7 +123,7 @@ BUDGETS = {
     "full": Budget(
         traits=None,
         ppo=PPO_BUDGETS["full"],
-        methods=tuple(METHODS),
+        methods=built_in_methods(),
         seeds=(0, 1, 2, 3),
         trials=(
             Trials(tuple(Conditions(Mix(p)) for p in (0.1, 0.25, 0.4, 0.6, 0.9)), 1000),

@@ -8,7 +8,7 @@ from tint_sumo.core.structures import plain
 from tint_sumo.dataset.recorder import record
 from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.methods.loading import shipped_policies
-from tint_sumo.methods.registry import Learned, find_learned, find_method, with_shared_trainings
+from tint_sumo.methods.registry import Learned, Rule, find_learned, find_method, with_shared_trainings
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, Scene, described, find_scene, paper_scene, require_built_in
 from tint_sumo.scenes.drivers import require_two_kinds
 from tint_sumo.study.budgets import Budget
@@ -25,6 +25,9 @@ def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
     scene = scene or paper_scene()
     learned = [name for name in budget.methods if isinstance(find_method(name), Learned)]
     rules = [name for name in budget.methods if name not in learned]
+    for method in map(find_method, rules):
+        if isinstance(method, Rule):
+            method.scene_for(scene)  # refuses SUMO's driver
     trained = with_shared_trainings(learned)
     for name in trained:
         find_learned(name).settings_of(budget.ppo)  # refuses what does not fit before hours of work

@@ -215,6 +215,32 @@ TOWN_SHIFTS = ("tau_shift_s", "speed_shift_mps", "gap_share")
 
 
 @dataclass(frozen=True)
+class Willingness:
+    """States of drivers whose trait is to yield, on which it depends whether they would do so now; default: always.
+
+    A driver that passes the ego is willing to yield to it with ``probability``, which grows towards 1 with the time for
+    which the ego has waited in the episode, in the time constant ``patience_s``. With ``braking_mps2``, a driver yields
+    only if braking so hard, which it draws uniformly from this range, stops it clear of the ego's way: an ego has to
+    leave it a gap. With ``attentive_s``, periods of attention and lapses follow one another, both of exponential
+    lengths, and in a lapse nobody notices that the ego claims the lane. Whoever has begun to yield does so until the
+    claim ends.
+    """
+
+    probability: Fraction = 1.0
+    patience_s: TimeS | None = None  # null: the probability does not depend on the ego's waiting
+    waiting_speed_mps: SpeedMps = 1.0  # an ego that is not faster waits
+    braking_mps2: tuple[AccelMps2, AccelMps2] | None = None  # null: as the claim has it
+    attentive_s: TimeS | None = None  # mean length of a period of attention; null: there are no lapses
+    lapse_s: TimeS = 2.0  # mean length of a lapse
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+        low, high = self.braking_mps2 or (0.0, 0.0)
+        if low > high:
+            raise InputError(f"braking_mps2 must be two numbers from low to high, not {low:g} and {high:g}")
+
+
+@dataclass(frozen=True)
 class Population:
     """The vTypes drivers are drawn from."""
 
@@ -227,6 +253,7 @@ class Population:
     fitted: Many[
         FittedDriver
     ] = ()  # the members of each profile follow as these, in turn; () as ``idm`` and profiles say
+    willingness: Willingness | None = None  # states of drivers who yield; None: they always would
 
     def __post_init__(self) -> None:
         names = [profile.name for profile in self.profiles]
@@ -235,6 +262,8 @@ class Population:
         if len(set(names)) < len(names):
             raise InputError(f"profiles must have names of their own, not {', '.join(names)}")
         require_ranges(self)
+        if self.willingness is not None and len({profile.yields for profile in self.profiles}) < 2:
+            raise InputError("willingness needs a profile that yields and one that does not, which are its labels")
         if self.towns is not None and self.towns.decel_mps2[1] > self.idm.emergency_decel_mps2:
             raise InputError(
                 f"decel_mps2 of towns must not exceed emergency_decel_mps2 ({self.idm.emergency_decel_mps2:g}), "
@@ -290,6 +319,10 @@ POPULATIONS = {
     ),
     "towns": _TOWNS,
     "held_out_towns": replace(_TOWNS, towns=Towns(count=64, seed=2023)),
+    "willing": Population(willingness=Willingness(probability=0.6)),
+    "gentle": Population(willingness=Willingness(braking_mps2=(1.0, 4.0))),
+    "inattentive": Population(willingness=Willingness(attentive_s=4.0, lapse_s=2.0)),
+    "polite": Population(willingness=Willingness(probability=0.2, patience_s=10.0)),
 }
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.scenes.networks import UserNetwork
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DRIVER_PROFILES, POPULATIONS, Population
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DRIVER_PROFILES, POPULATIONS, Population, Willingness
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.structures import plain
 from tint_sumo.scenes import (
@@ -129,6 +129,15 @@ def test_populations() -> None:
     assert read_population({"idm": {"tau_s": 2}}).profiles == DRIVER_PROFILES
     assert [profile.name for profile in read_population([SHY]).profiles] == ["shy"]
     assert read_population(plain(POPULATIONS["traits"])) == POPULATIONS["traits"]
+    assert read_population(plain(POPULATIONS["gentle"])) == POPULATIONS["gentle"]
+    states = {"probability": 0.5, "braking_mps2": [1, 4]}
+    assert read_population({"willingness": states}).willingness == Willingness(0.5, braking_mps2=(1.0, 4.0))
+
+
+def test_populations_without_newer_settings_give_scenes_the_names_of_earlier_versions() -> None:
+    assert changed(population="towns").name == "four_way-2f3616"
+    others: list[Any] = [{"base": "towns", "towns": {"episodes": 2}}, "willing", "gentle"]
+    assert len({changed(population=population).name for population in ("towns", *others)}) == 4
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def test_touching_a_vehicle_is_a_collision_with_its_vtype(user_network: Make) ->
             pass
         collision, egos = simulation.egos.collision[0], simulation.egos
         assert collision is not None
-        assert (scene.vtypes[collision.member], collision.route) == ("van", "ramp")
+        assert (scene.vtypes[collision.trait], collision.route) == ("van", "ramp")
         assert egos.distance_m[0, collision.slot] == 0.0
         assert 50.0 - 7.0 < egos.front_m[0] < 50.0 - 7.0 + 0.3 + 1e-6  # the van's back is at 43 m
 

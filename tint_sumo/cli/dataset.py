@@ -17,7 +17,8 @@ _SUMOCFG = optional("FILE", "SUMO configuration in place of a scene: its network
 _POPULATION = optional(
     f"{{{','.join(POPULATIONS)}}}",
     "traits: conservative and aggressive drivers. continuous: desired speeds and gaps of all kinds, without classes. "
-    "same_speed, same_gap: traits that do not differ in it. towns, held_out_towns: each episode in a town.",
+    "same_speed, same_gap: traits that do not differ in it. towns, held_out_towns: each episode in a town. "
+    "willing, gentle, inattentive, polite: states of drivers decide whether they yield.",
     "the scene's, traits in built-in scenes",
 )
 

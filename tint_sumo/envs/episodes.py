@@ -282,8 +282,6 @@ class Episodes:
         scene = settings.played
         self.simulation = make_simulation(num_envs, scene, settings.backend)
         self.rows = np.zeros(num_envs, settings.row_type) if rows is None else rows
-        traits = (*self.simulation.trait_of_member, NO_VEHICLE)  # the last one stands for empty slots
-        self._trait_of_member = np.array(traits, np.int16)
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
         self._scales = Scales(POSITION_SCALE_M, scene.speed_scale_mps, scene.step_s)
         self._speeds_mps = np.array(scene.ego.controller.desired_speeds_mps)
@@ -375,7 +373,7 @@ class Episodes:
 
     def _observe_with(self, sensing: Sensing, envs: slice) -> None:
         egos, slots, rows = self.simulation.egos, self.simulation.slots, self.rows[envs]
-        traits = self._trait_of_member[slots.member[envs]]
+        traits = self.simulation.traits(envs)
         sensing.look(envs)
         observe(
             egos.box[envs],
@@ -425,7 +423,5 @@ class Episodes:
         event = self.simulation.egos.collision[index]
         if event is None or self.rows["outcome"][index] != COLLISION:
             return {}
-        is_person = event.member == NO_VEHICLE
-        of_member = self.simulation.trait_of_member
-        trait = PEDESTRIAN if is_person else self.simulation.scene.traits[of_member[event.member]]
+        trait = PEDESTRIAN if event.trait == NO_VEHICLE else self.simulation.scene.traits[event.trait]
         return {"trait": trait, "route": event.route, "slot": event.slot, "ego_m": (event.ego_x_m, event.ego_y_m)}

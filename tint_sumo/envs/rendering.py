@@ -52,8 +52,9 @@ def render_scene(
     for building in simulation.buildings:
         canvas.fill(shapely.Polygon(building), BUILDING_COLOUR)
     slots, ego = simulation.slots, simulation.egos.box[replica]
+    (traits,) = simulation.traits(slice(replica, replica + 1))
     for slot in np.flatnonzero(slots.present[replica]).tolist():
-        colour = colours[simulation.trait_of_member[slots.member[replica, slot]]]
+        colour = colours[traits[slot]]
         is_seen = seen is None or bool(seen[slot])
         shown = colour if is_seen else pale(colour)
         canvas.body(simulation.bodies.get(slot), shown)

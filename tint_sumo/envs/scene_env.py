@@ -91,7 +91,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | Key            | Content                                                                                     |
     |----------------|---------------------------------------------------------------------------------------------|
     | `traits`       | `(V,)` int16, true traits: number of the driver's profile, 0 conservative and 1 aggressive;  |
-    |                | -1 in empty slots                                                                           |
+    |                | -1 in empty slots. In a population with `willingness`: would it yield now? 0 yes, 1 no      |
     | `position_m`   | with `tracks`: `(V,)` where each vehicle's front is seen on its route; 0 in empty slots     |
     | `gap_m`        | with `tracks`: `(V,)` the gap that is seen to the next vehicle ahead; infinite without one  |
     | `passed`       | with `tracks`: `(V,)` int8, 1 where the ego has left the vehicle's route behind             |

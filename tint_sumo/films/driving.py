@@ -17,7 +17,7 @@ from tint_sumo.methods.loading import Contender
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.trait_sources import Observation, OracleTraits, one_hot
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
-from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers
+from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.scene import Building
 from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation import SceneSimulation, Simulation
@@ -143,7 +143,6 @@ class _Recorder:
         brakes, ego_brakes = self._speeds.brakes()
         attention = None if self._network is None else self._network.attention_weights(observation)[0]
         self._observed = info["traits"]
-        of_member = np.append(simulation.trait_of_member, NO_VEHICLE)
         self.moments.append(
             Moment(
                 time_s=len(self.moments) * simulation.scene.step_s,
@@ -158,7 +157,7 @@ class _Recorder:
                 bodies=simulation.bodies,
                 pedestrians=simulation.pedestrians.copy(),
                 brakes=brakes,
-                traits=of_member[slots.member[0]],
+                traits=simulation.traits()[0],
                 observed_traits=self._by_vehicle(observation[TRAITS][0]) if TRAITS in observation else None,
                 attention=None if attention is None else self._by_vehicle(attention),
                 claimed=_claimed(simulation),

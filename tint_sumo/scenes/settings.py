@@ -125,7 +125,8 @@ class SceneSettings:
         """Return the settings from which a name is made; without what is newer it is that of earlier versions."""
         named = {name: value for name, value in plain(self).items() if name != "buildings" or value != []}
         drivers = _without(
-            named["population"], {"towns": None, "car_following": Population.car_following, "fitted": []}
+            named["population"],
+            {"towns": None, "car_following": Population.car_following, "fitted": [], "willingness": None},
         )
         if "towns" in drivers:
             drivers["towns"] = _without(drivers["towns"], {"episodes": Towns.episodes})

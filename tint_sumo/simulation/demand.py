@@ -11,6 +11,8 @@ from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Floats, Numbers
 from tint_sumo.scenes.layout import Layout
 from tint_sumo.simulation.slots import Slots
 
+_SEED_LIMIT = 2**63
+
 
 @dataclass(frozen=True)
 class PlacedVehicle:
@@ -19,6 +21,7 @@ class PlacedVehicle:
     route: int
     front_m: float  # front bumper's distance along the route, a vehicle's length at the entry
     member: int  # index into the population
+    seed: int = 0  # of the driver's state, see ``tint_sumo.simulation.willingness``
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,7 @@ class Driver:
     member: int  # index into the population's members
     gap_m: float  # bumper gap to the vehicle ahead that it waits for
     wait_s: float  # time since the driver before it; 0 in saturated traffic
+    seed: int = 0  # of its state
 
 
 class DriverPool:
@@ -64,7 +68,8 @@ class DriverStream:
         low_m, high_m = pool.population[member].entry_gap_m
         gap_m = low_m + (high_m - low_m) * rng.random()
         wait_s = 0.0 if traffic.arrivals_per_s is None else rng.exponential(1.0 / traffic.arrivals_per_s)
-        return Driver(member, gap_m, wait_s)
+        seed = 0 if pool.scene.population.willingness is None else int(rng.integers(_SEED_LIMIT))
+        return Driver(member, gap_m, wait_s, seed)
 
     def take(self) -> Driver:
         """Return the upcoming driver, and draw the next one."""
@@ -113,7 +118,7 @@ class Demand:
         )
         self._streams[replica] = streams
         placed = [
-            PlacedVehicle(route, front_m, driver.member)
+            PlacedVehicle(route, front_m, driver.member, driver.seed)
             for route, stream in enumerate(streams)
             for driver, front_m in stream.placement(self._layout.routes[route].length_m)
         ]
@@ -161,7 +166,7 @@ class Demand:
         """Return the driver that enters a route now."""
         driver = self._streams[replica][route].take()
         self._expect(replica, route, time_s)
-        return PlacedVehicle(route, self.entry_m, driver.member)
+        return PlacedVehicle(route, self.entry_m, driver.member, driver.seed)
 
     def _expect(self, replica: int, route: int, time_s: float) -> None:
         upcoming = self._streams[replica][route].upcoming

@@ -32,7 +32,7 @@ class Collision:
     """The ego's first collision in an episode."""
 
     slot: int  # slot of the other vehicle; NO_VEHICLE for a person on foot
-    member: int  # number of its driver in the population; NO_VEHICLE for a person
+    trait: int  # number of its driver's trait then; NO_VEHICLE for a person
     route: str  # name of its route; in a SUMO configuration, the edge that it is on
     ego_x_m: float  # the ego's centre
     ego_y_m: float

@@ -12,13 +12,13 @@ import numpy as np
 from tint_sumo.config import Backend
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.drivers import members
-from tint_sumo.scenes.geometry import Bools, Floats, Numbers, place
+from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Floats, Numbers, place
 from tint_sumo.scenes.layout import layout
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import Scene, View
 from tint_sumo.simulation.demand import Demand, PlacedVehicle
 from tint_sumo.simulation.lanes import LanePositions
-from tint_sumo.simulation.simulation import Simulation
+from tint_sumo.simulation.simulation import Simulation, Traits
 from tint_sumo.simulation.sumo import NO_COLLISION_CHECK, SumoLink
 from tint_sumo.simulation.timing import StepPart, does
 from tint_sumo.simulation.yielding import Yielding
@@ -48,6 +48,8 @@ class SceneSimulation(Simulation):
         self.population = members(scene.population)
         profiles = scene.population.profiles
         self.trait_of_member = np.array([profiles.index(member.profile) for member in self.population])
+        refusing = (index for index, profile in enumerate(profiles) if not profile.yields)
+        self._refusing_trait = np.int16(next(refusing, NO_VEHICLE))  # of drivers who would not yield now
         self.passed_m, self.stop_line_m = self.layout.zones.passed_m, self.layout.zones.stop_line_m
         self._build(scene.buildings)
         self._with_ego = with_ego
@@ -67,6 +69,12 @@ class SceneSimulation(Simulation):
     @property
     def town(self) -> Numbers:
         return self._demand.town
+
+    def traits(self, replicas: slice = slice(None)) -> Traits:
+        traits = super().traits(replicas)
+        if self.scene.population.willingness is None:
+            return traits
+        return np.where(self.yielding.refuses[replicas], self._refusing_trait, traits)
 
     def view(self, replica: int) -> View:  # noqa: ARG002 - the same for all
         return self.scene.view
@@ -123,7 +131,7 @@ class SceneSimulation(Simulation):
         self.lanes.enter(replica, slot, placed.front_m)
         self._demand.enter(replica, placed.route, slot)
         self.link.add(replica, slot, number, placed.route, placed.front_m, driver)
-        self.yielding.enter(replica, slot, driver.desired_speed_mps)
+        self.yielding.enter(replica, slot, driver.desired_speed_mps, placed.seed, float(self.time_s[replica]))
 
     def _forget(self, replica: int, slot: int) -> None:
         self.slots.leave(replica, slot)
@@ -146,6 +154,7 @@ class SceneSimulation(Simulation):
         self.lanes.follow(*self.link.lane_positions_m())
         if self._with_ego:
             self._look_around()
+        self.yielding.follow(self.time_s, self.egos.speed_mps if self._with_ego else None)
         self._admit()
 
     def _place_egos(self, replicas: slice) -> None:

@@ -2,11 +2,13 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tint_sumo.scenes.drivers import NO_TOWN
-from tint_sumo.scenes.geometry import BOX, Bools, Boxes, Floats, Numbers
+from tint_sumo.scenes.geometry import BOX, NO_VEHICLE, Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import Building, Scene, View
 from tint_sumo.scenes.sight import walls_of
@@ -14,6 +16,8 @@ from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation.connection import Connection
 from tint_sumo.simulation.ego import Collision, Egos
 from tint_sumo.simulation.slots import Slots
+
+Traits = NDArray[np.int16]  # numbers of traits; labels are these
 
 
 class Simulation(ABC):
@@ -66,6 +70,14 @@ class Simulation(ABC):
         """Number (R,) of the town of each episode, for ``tint_sumo.scenes.drivers.draw_town``; or ``NO_TOWN``."""
         return np.full(self.replicas, NO_TOWN)
 
+    def traits(self, replicas: slice = slice(None)) -> Traits:
+        """Return the numbers of the drivers' traits (R, V) as they are now; ``NO_VEHICLE`` in empty slots."""
+        return self._trait_or_none[self.slots.member[replicas]]
+
+    @cached_property
+    def _trait_or_none(self) -> Traits:
+        return np.array((*self.trait_of_member, NO_VEHICLE), np.int16)
+
     @property
     def bodies(self) -> Mapping[int, Boxes]:
         """The pieces (P,) of vehicles that bend, by their slots, whose box is the nearest of them; for pictures."""
@@ -103,7 +115,7 @@ class Simulation(ABC):
     def _look_around(self) -> None:
         """Run the egos' safety check, and keep their first collisions."""
         for replica, slot in self.egos.look_around(self.slots):
-            ego, member = self.egos.box[replica], int(self.slots.member[replica, slot])
+            ego, trait = self.egos.box[replica], int(self.traits(slice(replica, replica + 1))[0, slot])
             self.egos.collision[replica] = Collision(
-                slot, member, self._road_of(replica, slot), float(ego["x_m"]), float(ego["y_m"])
+                slot, trait, self._road_of(replica, slot), float(ego["x_m"]), float(ego["y_m"])
             )

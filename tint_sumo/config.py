@@ -32,6 +32,7 @@ MOST_DECISIONS = 2**22  # of a batch of PPO
 
 POSITION_SCALE_M = 20.0  # positions are observed divided by this (code)
 SPEED_SCALE_MPS = 3.0  # velocities are observed divided by this: the ego's top desired speed
+OBSERVATION_BOUND = 2.0  # of normalised observations: 40 m, 6 m/s
 
 Backend = Literal["auto", "libsumo", "traci"]
 EgoControl = Literal["speed", "sumo"]

@@ -163,7 +163,7 @@ def test_observations_are_scaled_and_bounded() -> None:
     steps = np.array([7, 30])
     source = np.where(present, np.arange(3), -1)
     track = np.array([[4, 7, -1], [-1, -1, 2]])
-    scales = Scales(20.0, 3.0, 0.1)
+    scales = Scales(20.0, 20.0, 3.0, 0.1)
     observe(egos, np.array([1.5, 30.0]), source, vehicles, traits, track, noise_m, steps, scales, rows)
     np.testing.assert_allclose(rows["ego"], [[0.1, -0.2, 0.3, 0.4], [2.0, -2.0, 0.0, -2.0]], atol=1e-7)
     np.testing.assert_allclose(rows["vehicles"][0], [[0.55, -0.6], [2.0, -2.0], [0.0, 0.0]], atol=1e-7)
@@ -183,7 +183,7 @@ def test_slots_of_the_observation_show_the_vehicles_that_they_are_given() -> Non
     )
     noise_m = np.array([[[0.0, 0.0], [0.0, 1.0], [0.5, 0.0]]])
     traits, source = np.array([[0, 1, 0]], np.int16), np.array([[2, -1, 1]])
-    scales = Scales(20.0, 3.0, 0.1)
+    scales = Scales(20.0, 20.0, 3.0, 0.1)
     track, steps = np.array([[5, -1, 3]]), np.array([1])
     observe(egos, np.zeros(1), source, vehicles[None], traits, track, noise_m, steps, scales, rows)
     np.testing.assert_allclose(rows["vehicles"][0] * 20.0, [[6.5, 0.0], [0.0, 0.0], [4.0, 1.0]], atol=1e-6)
@@ -270,12 +270,14 @@ def test_rules_are_those_of_the_scene_and_of_the_preset() -> None:
     assert TaskRules.of(replace(scene, time_limit_s=3.0, step_s=0.2), preset).step_limit == 15
 
 
-def test_a_second_in_a_sumo_configuration_is_worth_as_much_whatever_the_step_and_the_top_speed(
+def test_the_way_in_a_sumo_configuration_is_worth_as_much_whatever_its_length_and_the_step(
     user_network: Callable[[str], UserNetwork],
 ) -> None:
-    preset = REWARD_PRESETS["paper"]
-    for name, step_s, top_mps in (("merge", 0.1, 3.0), ("grid", 1.0, 3.0), ("autobahn", 0.5, 12.0)):
-        rules = TaskRules.of(user_network(name).scene(), preset)
-        assert rules.speed_weight_per_mps * top_mps / step_s == pytest.approx(0.05 * 3.0 / 0.1)
+    preset, paper = REWARD_PRESETS["paper"], find_scene("t_intersection")
+    whole = (paper.ego.goal_m - paper.ego.start_m) * 0.05 / 0.1
+    for name, step_s in (("merge", 0.1), ("grid", 1.0), ("autobahn", 0.5)):
+        scene = user_network(name).scene()
+        rules = TaskRules.of(scene, preset)
+        assert rules.speed_weight_per_mps / step_s * (scene.goal_m - scene.start_m) == pytest.approx(whole, rel=1e-3)
         assert rules.step / step_s == pytest.approx(-0.0013 / 0.1)
         assert (rules.goal, rules.collision) == (2.5, -2.0)

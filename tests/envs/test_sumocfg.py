@@ -97,6 +97,17 @@ def test_the_speed_of_a_fast_ego_is_seen(user_network: Make) -> None:
         assert 12.0 * np.hypot(*observation["ego"][2:]) == pytest.approx(egos.speed_mps[0], rel=1e-5)
 
 
+def test_the_position_of_the_ego_is_seen_all_along_its_way(user_network: Make) -> None:
+    scene = user_network("merge").scene(controller=EgoController((0.0, 5.0, 12.0)))
+    with made(scene) as env:
+        env.reset(seed=1)
+        for _ in range(80):
+            observation, *_ = env.step(2)
+        box = env.simulation.egos.box[0]
+        assert box["x_m"] > 40.0
+        assert observation["ego"][:2] * 55.0 == pytest.approx([box["x_m"], box["y_m"]], rel=1e-5)
+
+
 def test_a_vector_has_as_many_workers_as_environments(user_network: Make) -> None:
     scene = user_network("merge").scene(warm_up_s=5.0, warm_starts=2)
     with pytest.raises(InputError, match="set workers to num_envs"):

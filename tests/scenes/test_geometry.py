@@ -21,6 +21,7 @@ from tint_sumo.scenes.geometry import (
     place,
     project,
     resample,
+    sweep,
     way_point,
 )
 
@@ -141,3 +142,19 @@ def test_leaders_are_seen_on_shared_lanes_of_other_routes_and_nowhere_else() -> 
     assert leader.tolist() == [[1, 3, 1, NO_VEHICLE, NO_VEHICLE]]
     assert gap_m[0, :3].tolist() == [13.0 - 8.0 - 5.0, 25.0 - 9.0 - 7.0, 9.0 - 5.5 - 5.0]
     assert np.isinf(gap_m[0, 3:]).all()
+
+
+def test_boxes_turn_on_their_way_between_two_steps() -> None:
+    """A car that drives away around a bend, close ahead of an ego that stands, does not touch it."""
+    ego, before, after = new_boxes(1, 5.0, 2.0), new_boxes(1, 5.0, 2.0), new_boxes(1, 5.0, 2.0)
+    ego[0] = (0.0, 0.0, 1.0, 0.0, 5.0, 2.0)
+    before[0] = (5.05, 0.0, 1.0, 0.0, 5.0, 2.0)
+    turned_rad = math.radians(20.0)
+    after[0] = (11.0, 1.0, math.cos(turned_rad), math.sin(turned_rad), 5.0, 2.0)
+    hit = np.full(1, NO_VEHICLE)
+    same = np.ones((1, 1), bool)
+    assert not sweep(ego, ego, same, before[None], after[None], 10, hit)
+    across = np.array([(0.0, 8.0, 0.0, 1.0, 5.0, 2.0)], BOX)
+    come_from = np.array([(0.0, -8.0, 0.0, 1.0, 5.0, 2.0)], BOX)
+    assert sweep(ego, ego, same, come_from[None], across[None], 10, hit)
+    assert hit[0] == 0

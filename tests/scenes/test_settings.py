@@ -111,7 +111,7 @@ def test_a_sumo_configuration(user_network: Callable[[str], UserNetwork]) -> Non
     merge = user_network("merge")
     task = {"ego_route": list(merge.ego_route), "start_m": 20, "goal_m": 130, "warm_up_s": 20}
     scene = read_scene({"sumocfg": str(merge.sumocfg), **task})
-    assert scene == merge.scene()
+    assert scene == merge.scene(controller=None)
     assert read_described(described([scene])) == (scene,)
     assert "perceives" not in described([scene])["scene_settings"], "cards are as before where nothing is perceived"
     watchful = read_scene({"sumocfg": str(merge.sumocfg), **task, "perceives": "lane", "red_light": "end"})

@@ -51,6 +51,22 @@ def test_the_ego_departs_where_it_starts_on_its_route(merge: UserNetwork) -> Non
     assert later.departure[1] == pytest.approx(5.0)
 
 
+def test_defaults_follow_the_speeds_of_the_network(merge: UserNetwork) -> None:
+    scene = merge.scene(controller=None)
+    assert scene.controller.desired_speeds_mps == (0.0, 13.9 / 2, 13.9)
+    assert scene.sight_m == pytest.approx(5.0 * 13.9)
+    assert merge.scene().sight_m == 50.0  # at 3 m/s
+    assert merge.scene(controller=None, sight_m=30.0).sight_m == 30.0
+
+
+def test_all_that_is_in_sight_and_all_of_the_way_is_within_the_bounds_of_observations(merge: UserNetwork) -> None:
+    scene = merge.scene(sight_m=120.0)
+    assert scene.position_scale_m * 2.0 == 120.0
+    assert scene.ego_scale_m * 2.0 == 130.0 - 20.0
+    near = merge.scene(sight_m=20.0, goal_m=30.0)
+    assert (near.position_scale_m, near.ego_scale_m) == (20.0, 20.0)  # as in the built-in scenes
+
+
 def test_long_steps_do_not_make_the_ego_overshoot(user_network: Make) -> None:
     assert user_network("grid").scene().ego.controller.gain_per_s == 1.0
     assert user_network("merge").scene().ego.controller.gain_per_s == 2.0
@@ -68,6 +84,7 @@ def test_long_steps_do_not_make_the_ego_overshoot(user_network: Make) -> None:
         ({"max_vehicles": 0}, "max_vehicles must lie in 1 to 200"),
         ({"sight_m": float("nan")}, "sight_m must lie in 0 to 1000"),
         ({"warm_up_s": -1.0}, "warm_up_s must lie in"),
+        ({"warm_up_spread_s": -1.0}, "warm_up_spread_s must lie in"),
         ({"warm_starts": -1}, "warm_starts must lie in 0 to 1,000"),
     ],
 )

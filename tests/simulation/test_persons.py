@@ -20,6 +20,7 @@ from tint_sumo.scenes.geometry import clearance_m
 from tint_sumo.scenes.network import sumo_program
 from tint_sumo.scenes.sumocfg import network_roads
 from tint_sumo.simulation import SumocfgSimulation
+from tint_sumo.simulation.bodies import Bodies
 from tint_sumo.simulation.ego_way import EGO
 
 _NODES = '<nodes><node id="w" x="0" y="0"/><node id="x" x="80" y="0"/><node id="e" x="200" y="0"/></nodes>'
@@ -101,6 +102,13 @@ def test_persons_are_where_sumo_has_them_even_with_the_id_of_a_vehicle(net: Path
                 assert math.dist((box["x_m"] + left_m, box["y_m"] + low_m), (x_m, y_m)) < 3.0
             assert len(simulation.slot) <= 1  # no person has a slot
         assert mixed > 0
+
+
+def test_the_way_of_a_long_vehicle_is_found_beside_pavements(net: Path) -> None:
+    with begun(street(net)) as simulation:
+        behind = Bodies(simulation.connection)._lane_behind(("wx", "xe"), 1, "xe_1")
+        assert behind is not None
+        assert simulation.connection.lane.getLinks(behind)[0][0] == "xe_1"
 
 
 @pytest.mark.parametrize("step_s", [0.1, 1.0])

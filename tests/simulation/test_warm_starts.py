@@ -120,6 +120,21 @@ def test_episodes_begin_with_the_same_traffic_and_go_on_differently(user_network
         assert lived(simulation, 1)[0] != lived(simulation, 2)[0]
 
 
+@pytest.mark.parametrize("warm_starts", [0, 3])
+def test_warm_ups_of_episodes_can_differ_in_length(warm_starts: int, user_network: Make) -> None:
+    scene = user_network("merge").scene(warm_up_spread_s=30.0, warm_starts=warm_starts)
+    times_s: dict[int, float] = {}
+    with simulating(scene) as simulation:
+        for seed in (0, 1, 2, 3, 4, 5):
+            simulation.reset(0, seed)
+            times_s[seed] = simulation.connection.simulation.getTime()
+        assert len(set(times_s.values())) == (warm_starts or 6)
+        assert all(20.0 < time_s < 20.0 + 30.0 + 5.0 for time_s in times_s.values())  # and until the ego has entered
+    with simulating(scene) as simulation:
+        simulation.reset(0, 3)
+        assert simulation.connection.simulation.getTime() == times_s[3]
+
+
 def test_loaded_traffic_is_that_which_was_saved(mixed: UserNetwork) -> None:
     with simulating(mixed.scene(warm_starts=3)) as simulation:
         for seed in range(6):

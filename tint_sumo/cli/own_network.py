@@ -15,9 +15,12 @@ _ROUTE = optional("EDGE [EDGE ...]", f"{EGO_ROUTE_HELP}; with --sumocfg.")
 _START = optional("FLOAT", "Start of the ego's front on its route, m; with --sumocfg.", "0")
 _GOAL = optional("FLOAT", "The ego's front past it on its route, m, is a success; with --sumocfg.")
 _SPEEDS = optional(
-    "FLOAT FLOAT [...]", "Desired speeds that the policy chooses from, m/s, rising; with --sumocfg.", "0 0.5 3"
+    "FLOAT FLOAT [...]",
+    "Desired speeds that the policy chooses from, m/s, rising; with --sumocfg.",
+    "nothing, half and all of the highest speed limit on the route",
 )
 _WARM_UP = optional("FLOAT", "Time for which the traffic runs before the ego appears, s; with --sumocfg.", "30")
+_SPREAD = optional("FLOAT", "Each episode draws by how much longer that is, s, from 0 to this; with --sumocfg.", "0")
 _WARM_STARTS = optional(
     "INT",
     "With --sumocfg, the traffic of so many seeds is warmed up once each for all episodes of a training; tests warm up "
@@ -36,8 +39,8 @@ _RED_LIGHT = optional(
     "ignore",
 )
 _TASK = (
-    *("ego_route", "start_m", "goal_m", "speeds_mps", "warm_up_s", "warm_starts", "time_limit_s"),
-    *("perceives", "red_light"),
+    *("ego_route", "start_m", "goal_m", "speeds_mps", "warm_up_s", "warm_up_spread_s", "warm_starts"),
+    *("time_limit_s", "perceives", "red_light"),
 )
 
 
@@ -51,6 +54,7 @@ class NetworkCommand(Command):
     goal_m: Annotated[RouteM | None, _GOAL] = None
     speeds_mps: Annotated[Many[SpeedMps] | None, _SPEEDS] = None
     warm_up_s: Annotated[WarmUpS | None, _WARM_UP] = None
+    warm_up_spread_s: Annotated[WarmUpS | None, _SPREAD] = None
     warm_starts: Annotated[WarmStarts | None, _WARM_STARTS] = None
     time_limit_s: Annotated[TimeS | None, _TIME_LIMIT] = None
     perceives: Annotated[Many[Perceivable] | None, _PERCEIVES] = None

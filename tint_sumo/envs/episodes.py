@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import (
     PERFECT,
-    POSITION_SCALE_M,
     REWARD_PRESETS,
     SENSORS,
     Backend,
@@ -283,7 +282,7 @@ class Episodes:
         self.simulation = make_simulation(num_envs, scene, settings.backend)
         self.rows = np.zeros(num_envs, settings.row_type) if rows is None else rows
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
-        self._scales = Scales(POSITION_SCALE_M, scene.speed_scale_mps, scene.step_s)
+        self._scales = Scales(scene.position_scale_m, scene.ego_scale_m, scene.speed_scale_mps, scene.step_s)
         self._speeds_mps = np.array(scene.ego.controller.desired_speeds_mps)
         self._steps_per_decision = settings.steps_per_decision
         self.steps = np.zeros(num_envs, np.int64)  # simulation steps since each episode's start

@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.config import SPEED_SCALE_MPS, STEP_S, RewardPreset
+from tint_sumo.config import OBSERVATION_BOUND, STEP_S, RewardPreset
 from tint_sumo.core.compiling import compiled
 from tint_sumo.scenes.drivers import NO_TOWN
 from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers
@@ -25,9 +25,10 @@ RED_LIGHT_TERM, COST = "red_light", "cost"  # fields of rows where driving over 
 Outcome = Literal["success", "timeout", "collision", "lost", "red_light"]
 OUTCOMES: tuple[str, ...] = get_args(Outcome)
 BUILT_IN_OUTCOMES = OUTCOMES[:3]  # SUMO takes no ego off the roads of built-in scenes
+_PAPER_WAY_M = 17.2  # from the ego's start to its goal in the paper's scene
 # Numbers of outcomes in rows: positions in OUTCOMES, plus 1.
 GOING_ON, _SUCCESS, _TIMEOUT, COLLISION, _LOST, RED_LIGHT = range(6)
-BOUND = 2.0  # limit of normalised observations: 40 m, 6 m/s
+BOUND = OBSERVATION_BOUND
 
 Rows = NDArray[np.void]  # records (N,) of a row type
 
@@ -148,18 +149,19 @@ class TaskRules(NamedTuple):
     def of(cls, scene: Scene | SumocfgScene, preset: RewardPreset) -> "TaskRules":
         """Return the rules of a scene.
 
-        In a SUMO configuration, driving at top speed for a second is worth as much as in the built-in scenes, whatever
-        that speed and the step are, and so is waiting.
+        In a SUMO configuration, driving all the way is worth as much as in the paper's scene, however long and fast it
+        is, and so that goal and collision weigh as much beside it. Waiting for a second costs as much as there.
         """
-        steps, tops = 1.0, 1.0  # steps of built-in scenes in one, and top speeds of built-in scenes in the ego's
+        steps, ways = 1.0, 1.0  # steps of built-in scenes in one, and ways of the paper's scene in this one
         if isinstance(scene, SumocfgScene):
-            steps, tops = scene.step_s / STEP_S, scene.ego.controller.desired_speeds_mps[-1] / SPEED_SCALE_MPS
+            steps = scene.step_s / STEP_S
+            ways = (scene.goal_m - scene.start_m) / _PAPER_WAY_M
         return cls(
             scene.ego.goal_m,
             round(scene.time_limit_s / scene.step_s),
             preset.goal,
             preset.collision,
-            preset.speed_weight_per_mps * steps / tops,
+            preset.speed_weight_per_mps * steps / ways,
             preset.step * steps,
         )
 
@@ -230,7 +232,8 @@ def add_up(before: Rows, rows: Rows) -> None:
 class Scales(NamedTuple):
     """The units of observations, and the length of a step."""
 
-    position_m: float
+    position_m: float  # of the others
+    ego_m: float
     speed_mps: float
     step_s: float
 
@@ -268,8 +271,8 @@ def observe(
         row, ego = rows[index], egos[index]
         speed = speed_mps[index] / scales.speed_mps
         row.time_s = steps[index] * scales.step_s
-        row.ego[0] = _bounded(ego.x_m / scales.position_m)
-        row.ego[1] = _bounded(ego.y_m / scales.position_m)
+        row.ego[0] = _bounded(ego.x_m / scales.ego_m)
+        row.ego[1] = _bounded(ego.y_m / scales.ego_m)
         row.ego[2] = _bounded(speed * ego.heading_x)
         row.ego[3] = _bounded(speed * ego.heading_y)
         for slot in range(source.shape[1]):

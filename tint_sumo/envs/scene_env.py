@@ -72,9 +72,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `speed`     | 0.05 x ego speed (m/s) otherwise  | 0.05 / 3 x ego speed otherwise    |
     | `step`      | -0.0013 otherwise                 | -0.013 otherwise                  |
 
-    In a SUMO configuration with steps of T s and a top speed of M m/s, `step` is multiplied by T / 0.1, and `speed` by
-    T / 0.1 x 3 / M: a second is worth as much as in the built-in scenes. If red lights have consequences there (see
-    Arguments), `red_light` is a term, too.
+    In a SUMO configuration with steps of T s and L m from the ego's start to its goal, `step` is multiplied by T / 0.1,
+    and `speed` by T / 0.1 x 17.2 / L: all of the way is worth as much as in the T-intersection, whose way has 17.2 m.
+    If red lights have consequences there (see Arguments), `red_light` is a term, too.
 
     ## Starting State
     The ego stands at its start (in the T-intersection with its centre at (0, -5)). All of the traffic's routes are
@@ -118,8 +118,9 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     * `scene`: name of a scene, a `tint_sumo.scenes.Scene`, or what `tint_sumo.scenes.from_sumocfg` makes of a SUMO
       configuration of your own. Then the traffic is the configuration's, several lanes and changes between them
-      included; `ego` is seen from where it starts, with the network's axes, its velocities divided by its top speed if
-      that is above 3 m/s; `vehicles` are the nearest in sight;
+      included; `ego` is seen from where it starts, with the network's axes, its position divided by half of the way
+      from its start to its goal, and its velocities by its top speed, if these are above 20 m and 3 m/s; `vehicles` are
+      the nearest in sight, divided by half of `sight_m` if that is above 20 m;
       `traits` are the numbers of their vTypes in `scene.vtypes`; `position_m` is what their odometers show, and
       `passed` is always 0. `perceives`, `red_light` and `ego_control` are arguments of the scene, which `from_sumocfg`
       describes. Such an environment is one simulation: a vector of them needs as many `workers` as

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tint_sumo.config import POSITION_SCALE_M
 from tint_sumo.methods.rules import Observation, State
 from tint_sumo.scenes import SumocfgScene
 from tint_sumo.scenes.geometry import Bools, Floats
@@ -39,7 +38,7 @@ class NetworkTimeToCollision:
         The state holds where each slot's vehicle was seen from the ego (N, V, 2), which slots held one (N, V), and the
         ego's heading (N, 2), 0 before it has moved.
         """
-        at_m = observation["vehicles"].astype(np.float64) * POSITION_SCALE_M
+        at_m = observation["vehicles"].astype(np.float64) * self.scene.position_scale_m
         present = observation["mask"] > 0.5
         velocity_mps = observation["ego"][:, 2:].astype(np.float64) * self.scene.speed_scale_mps
         if state is None:

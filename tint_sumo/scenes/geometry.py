@@ -126,6 +126,29 @@ def follow(
 
 
 @compiled
+def place_seen(
+    slot: Numbers, seen: Floats, origin_x_m: float, origin_y_m: float, front_m: Floats, boxes: Boxes
+) -> None:
+    """Write where SUMO sees vehicles.
+
+    Args:
+        slot: (N,) of the vehicles in the arrays (S,) that are written: ``front_m`` and ``boxes``, which have sizes.
+        seen: (N, 4) x and y of their fronts in the network, their angles clockwise from north in degrees, and the
+            distances that they have driven.
+        origin_x_m, origin_y_m: the origin of the boxes' frame in the network.
+    """
+    for vehicle in range(len(slot)):
+        x_m, y_m, angle_deg, driven_m = seen[vehicle]
+        angle_rad = math.radians(angle_deg)
+        box = boxes[slot[vehicle]]
+        box.heading_x, box.heading_y = math.sin(angle_rad), math.cos(angle_rad)
+        half_m = box.length_m / 2
+        box.x_m = x_m - half_m * box.heading_x - origin_x_m
+        box.y_m = y_m - half_m * box.heading_y - origin_y_m
+        front_m[slot[vehicle]] = driven_m
+
+
+@compiled
 def find_leaders(
     present: Bools,
     route: Numbers,
@@ -281,8 +304,14 @@ def sweep(
 
 @compiled
 def between(first: Any, last: Any, share: float, box: Any) -> None:
-    """Write the box at a share of the way from one box to another, whose heading it has."""
+    """Write the box at a share of the way from one box to another, towards whose heading it has turned as far."""
     box.x_m = first.x_m + share * (last.x_m - first.x_m)
     box.y_m = first.y_m + share * (last.y_m - first.y_m)
-    box.heading_x, box.heading_y = last.heading_x, last.heading_y
+    heading_x = first.heading_x + share * (last.heading_x - first.heading_x)
+    heading_y = first.heading_y + share * (last.heading_y - first.heading_y)
+    norm = math.hypot(heading_x, heading_y)
+    if norm > 0.0:  # else it has turned round
+        box.heading_x, box.heading_y = heading_x / norm, heading_y / norm
+    else:
+        box.heading_x, box.heading_y = last.heading_x, last.heading_y
     box.length_m, box.width_m = last.length_m, last.width_m

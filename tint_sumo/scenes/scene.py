@@ -12,6 +12,7 @@ from typing import ClassVar
 import shapely
 
 from tint_sumo.config import (
+    POSITION_SCALE_M,
     SPEED_SCALE_MPS,
     Claim,
     CoordinateM,
@@ -142,6 +143,16 @@ class Scene:
     def speed_scale_mps(self) -> float:
         """Velocities are observed divided by this."""
         return SPEED_SCALE_MPS
+
+    @property
+    def position_scale_m(self) -> float:
+        """Positions of the others are observed divided by this."""
+        return POSITION_SCALE_M
+
+    @property
+    def ego_scale_m(self) -> float:
+        """The ego's position is observed divided by this."""
+        return POSITION_SCALE_M
 
     def with_drivers(self, p_conservative: Mix | None, tau_s: float | None) -> "Scene":
         """Return the scene with another mix and another time headway of its drivers, where they are given."""

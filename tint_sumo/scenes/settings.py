@@ -147,18 +147,20 @@ class SumocfgSettings:
     """The ego's front past it is a success."""
     max_vehicles: Slots = SumocfgScene.max_vehicles
     """Most vehicles in an observation, the nearest ones."""
-    sight_m: DistanceM = SumocfgScene.sight_m
-    """Farthest distance at which they are observed."""
+    sight_m: DistanceM | None = None
+    """Farthest distance at which they are observed; null: 50 m, or more where the ego is fast."""
     warm_up_s: WarmUpS = SumocfgScene.warm_up_s
     """Time for which the traffic runs before the ego appears."""
+    warm_up_spread_s: WarmUpS = SumocfgScene.warm_up_spread_s
+    """Each episode draws by how much longer that is, from 0 to this."""
     warm_starts: WarmStarts = SumocfgScene.warm_starts
     """The traffic of so many seeds is warmed up once each for all episodes; 0: each has a warm-up of its own."""
     time_limit_s: TimeS = SumocfgScene.time_limit_s
     """Longest time of an episode."""
     vehicle: VehicleShape = field(default_factory=VehicleShape)
     """The ego's shape."""
-    controller: EgoController = field(default_factory=EgoController)
-    """Controller of the ego; its desired speeds are the actions."""
+    controller: EgoController | None = None
+    """Controller of the ego; its desired speeds are the actions. null: nothing, half and all of the speed limit."""
     ego_control: EgoControl = SumocfgScene.ego_control
     """Driver of the ego: the actions (speed), or SUMO's driver (sumo)."""
     perceives: Many[Perceivable] = SumocfgScene.perceives

@@ -17,6 +17,8 @@ import shapely
 import sumolib
 
 from tint_sumo.config import (
+    OBSERVATION_BOUND,
+    POSITION_SCALE_M,
     SPEED_SCALE_MPS,
     DistanceM,
     EgoControl,
@@ -41,6 +43,7 @@ from tint_sumo.scenes.sumo_run import require_loads
 NET_VERSION = (1, 20)  # the version that this SUMO's netconvert writes into networks
 EGO_CLASS = "passenger"
 _COLOURS = ((40, 90, 200), (200, 40, 40), (30, 140, 70), (130, 60, 170), (220, 110, 20), (20, 150, 170), (90, 90, 90))
+_SIGHT_S = 5.0  # the ego sees as far as it drives in this time
 _SEAM_M = 0.06  # half of the line between two lanes
 
 
@@ -66,6 +69,7 @@ class SumocfgScene:
     max_vehicles: Slots = 12
     sight_m: DistanceM = 50.0
     warm_up_s: WarmUpS = 30.0  # the traffic runs for so long before the ego appears
+    warm_up_spread_s: WarmUpS = 0.0  # and for up to so much longer, which each episode draws
     warm_starts: WarmStarts = 0  # so many states of the traffic are warmed up for all episodes; 0: each has its own
     time_limit_s: TimeS = 50.0
     vehicle: VehicleShape = field(default_factory=VehicleShape)
@@ -128,6 +132,16 @@ class SumocfgScene:
         return max(SPEED_SCALE_MPS, self.controller.desired_speeds_mps[-1])
 
     @property
+    def position_scale_m(self) -> float:
+        """Positions of the others are observed divided by this, such that all in sight are within the bounds."""
+        return max(POSITION_SCALE_M, self.sight_m / OBSERVATION_BOUND)
+
+    @property
+    def ego_scale_m(self) -> float:
+        """The ego's position is observed divided by this, such that all of its way is within the bounds."""
+        return max(POSITION_SCALE_M, (self.goal_m - self.start_m) / OBSERVATION_BOUND)
+
+    @property
     def departure(self) -> tuple[tuple[str, ...], float]:
         """The edges that are left of the route where the ego starts, and its front's position on the first of them."""
         number = max(index for index, edge_m in enumerate(self.route_edge_start_m) if edge_m <= self.start_m)
@@ -141,8 +155,9 @@ def from_sumocfg(
     goal_m: float,
     *,
     max_vehicles: int = SumocfgScene.max_vehicles,
-    sight_m: float = SumocfgScene.sight_m,
+    sight_m: float | None = None,
     warm_up_s: float = SumocfgScene.warm_up_s,
+    warm_up_spread_s: float = SumocfgScene.warm_up_spread_s,
     warm_starts: int = SumocfgScene.warm_starts,
     time_limit_s: float = SumocfgScene.time_limit_s,
     vehicle: VehicleShape | None = None,
@@ -160,13 +175,17 @@ def from_sumocfg(
         start_m: position of the ego's front on its route at the beginning; not on a junction.
         goal_m: the ego's front past it is a success.
         max_vehicles: most vehicles in an observation, the nearest ones.
-        sight_m: farthest distance at which they are observed.
+        sight_m: farthest distance at which they are observed; by default 50 m, or what the ego drives in 5 s at its
+            highest desired speed if that is more.
         warm_up_s: time for which the traffic runs before the ego appears.
+        warm_up_spread_s: each episode draws by how much longer than ``warm_up_s`` that is, from 0 to this. Where the
+            demand has fixed times of departure, all episodes begin with nearly the same traffic without it.
         warm_starts: the traffic of so many seeds is warmed up once each, and an episode begins with one of them, which
             its seed chooses; it then goes on with random numbers of its own. 0: each episode has a warm-up of its own.
         time_limit_s: of an episode.
         vehicle: the ego's shape.
-        controller: of the ego; its desired speeds are the actions.
+        controller: of the ego; its desired speeds are the actions. By default they are nothing, half and all of the
+            highest speed limit on its route.
         ego_control: "sumo" lets SUMO's driver of a default passenger car drive the ego, up to its highest desired
             speed and the speed limit, as a baseline on the same cases: it obeys traffic lights and the right of way,
             keeps its distance, and takes no notice of actions.
@@ -194,6 +213,7 @@ def from_sumocfg(
     if not any(first_m <= start_m <= last_m for first_m, last_m in spans_m):
         ends = ", ".join(f"{first_m:.1f} to {last_m:.1f}" for first_m, last_m in spans_m)
         raise InputError(f"the ego's start ({start_m:g} m) is on a junction; its route's edges are at {ends} m")
+    driven = controller or controller_for(net, tuple(ego_route))
     return SumocfgScene(
         name=config.name,
         config=config,
@@ -203,12 +223,13 @@ def from_sumocfg(
         goal_m=float(goal_m),
         route_edge_start_m=edge_start_m,
         max_vehicles=max_vehicles,
-        sight_m=sight_m,
+        sight_m=max(SumocfgScene.sight_m, _SIGHT_S * driven.desired_speeds_mps[-1]) if sight_m is None else sight_m,
         warm_up_s=warm_up_s,
+        warm_up_spread_s=warm_up_spread_s,
         warm_starts=warm_starts,
         time_limit_s=time_limit_s,
         vehicle=vehicle or VehicleShape(),
-        controller=controller or EgoController(),
+        controller=driven,
         ego_control=ego_control,
         perceives=tuple(perceives),
         red_light=red_light,
@@ -233,6 +254,12 @@ def _in_order(perceives: Any) -> tuple[Perceivable, ...]:
     for name in perceives:
         _require_choice("perceives", name, Perceivable)
     return tuple(name for name in get_args(Perceivable) if name in perceives)
+
+
+def controller_for(net: Any, edges: tuple[str, ...]) -> EgoController:
+    """Return a controller with nothing, half and all of the highest speed limit on a route as desired speeds."""
+    limit_mps = max(float(net.getEdge(edge).getSpeed()) for edge in edges)
+    return EgoController((0.0, limit_mps / 2, limit_mps))
 
 
 def read_net(file: Path, *, with_internal: bool = True) -> Any:

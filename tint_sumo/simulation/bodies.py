@@ -126,7 +126,9 @@ class Bodies:
             first = f"{edge}_{number}"
             for link in lanes.getLinks(first):
                 before, after = first, link[4] or link[0]
-                while after != lane and after.startswith(":"):
+                passed = set()  # from a pavement, persons can go round and round a junction
+                while after != lane and after.startswith(":") and after not in passed and lanes.getLinks(after):
+                    passed.add(after)
                     follow = lanes.getLinks(after)[0]
                     before, after = after, follow[4] or follow[0]
                 if after == lane:

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from enum import Enum, auto
 from typing import Any
 
+import numpy as np
 from libsumo import constants
 
 from tint_sumo.simulation.connection import SUMO_ERRORS, Connection
@@ -34,12 +35,16 @@ class EgoWay:
     Args:
         connection: the simulation.
         edges: the ego's route.
+        most_m: it drives no further in a step.
     """
 
-    def __init__(self, connection: Connection, edges: Sequence[str]) -> None:
+    def __init__(self, connection: Connection, edges: Sequence[str], most_m: float) -> None:
         self._connection = connection
         self._edges = tuple(edges)
-        self._end_m = float(connection.lane.getLength(f"{edges[-1]}_0"))
+        *_, self._end_m = lengths_m = [float(connection.lane.getLength(f"{edge}_0")) for edge in edges]
+        # The route's end can be reached in a step from the edges after which so little is left.
+        left_m = np.cumsum(lengths_m[::-1])[::-1] - lengths_m
+        self._near_end = int(np.argmax(left_m <= most_m + _ARRIVAL_M))
         connection.vehicle.subscribe(EGO, (constants.VAR_ROUTE_ID, constants.VAR_ROAD_ID))
         found = connection.vehicle.getSubscriptionResults(EGO)
         self._route_id = EGO
@@ -70,6 +75,7 @@ class EgoWay:
             except SUMO_ERRORS:  # such as an edge ahead that a rerouter has closed
                 return False
             self._route_id = vehicle.getRouteID(EGO)
-        left_m = vehicle.getDrivingDistance(EGO, self._edges[-1], self._end_m)
-        self._left_m = left_m if left_m >= 0.0 else math.inf
+        if self._number >= self._near_end:
+            left_m = vehicle.getDrivingDistance(EGO, self._edges[-1], self._end_m)
+            self._left_m = left_m if left_m >= 0.0 else math.inf
         return True

@@ -73,6 +73,8 @@ class Persons:
 
     def follow(self, on_foot: Sights, origin_m: tuple[float, float], ego_z_m: float) -> None:
         """Take over where the persons are that are on the ego's level."""
+        if not on_foot and not self.ids:
+            return
         near = {
             name: sight
             for name, sight in on_foot.items()

@@ -14,7 +14,7 @@ from libsumo import constants
 
 from tint_sumo.config import NO_LEADER_GAP_M, Backend
 from tint_sumo.core.errors import InputError
-from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers
+from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers, place_seen
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import BUILDING, Building, View
 from tint_sumo.scenes.sumo_config import DEFAULT_VTYPE, SumoConfig, base_vtype
@@ -125,6 +125,7 @@ class SumocfgSimulation(Simulation):
         self._any_long = False
         self.persons = Persons(scene, self.connection)
         self.perception = Perception(scene, self.connection)
+        self._step_s = scene.step_s  # which is looked up in the configuration
         self._drives = False
         self._accel_mps2 = 0.0  # of the ego, where SUMO drives it
         self.slot: dict[str, int] = {}
@@ -156,7 +157,8 @@ class SumocfgSimulation(Simulation):
             self._define_ego()
             self._let_ego_enter()
             self._look_as_far_as_needed()
-            self._way = EgoWay(self.connection, self.scene.departure[0])
+            fastest_mps = self.connection.vehicle.getMaxSpeed(EGO)
+            self._way = EgoWay(self.connection, self.scene.departure[0], fastest_mps * self._step_s)
             seen = self.connection.vehicle.getContextSubscriptionResults(EGO)
         if EGO not in seen:
             raise self._taken_at_start()
@@ -248,7 +250,7 @@ class SumocfgSimulation(Simulation):
             self.perception.end(arrived=False)
             return
         with self._refusals:
-            moved_m = self._drive(desired_speed_mps) * self.scene.step_s
+            moved_m = self._drive(desired_speed_mps) * self._step_s
             self.connection.step()
             fate = self._way.look(moved_m)
         if fate is Fate.DRIVES:
@@ -260,7 +262,7 @@ class SumocfgSimulation(Simulation):
     def _drive(self, desired_speed_mps: Floats) -> float:
         """Choose the ego's speed in this step, if SUMO does not; return it, or the highest that SUMO may choose."""
         if self.scene.ego_control == "sumo":
-            return float(self.egos.speed_mps[0]) + self._accel_mps2 * self.scene.step_s
+            return float(self.egos.speed_mps[0]) + self._accel_mps2 * self._step_s
         self.egos.drive(desired_speed_mps)
         speed_mps = float(self.egos.speed_mps[0])
         self.connection.vehicle.setSpeed(EGO, speed_mps)
@@ -322,13 +324,22 @@ class SumocfgSimulation(Simulation):
     def _in_sight(self, seen: Mapping[str, Sight], front_m: tuple[float, float, float]) -> dict[str, Sight]:
         """Return the vehicles that are on the ego's level, not parked beside the road, and in sight."""
         self._long.clear()
-        return {vehicle_id: sight for vehicle_id, sight in seen.items() if self._meets(vehicle_id, sight, front_m)}
+        z_m = front_m[2]
+        return {
+            vehicle_id: sight
+            for vehicle_id, sight in seen.items()
+            if not sight[constants.VAR_STOPSTATE] & _PARKS
+            and (
+                # Nearly all vehicles are as high as the ego.
+                (not self._any_long and abs(sight[constants.VAR_POSITION3D][2] - z_m) <= _LEVEL_M)
+                or self._meets(vehicle_id, sight, front_m)
+            )
+        }
 
     def _meets(self, vehicle_id: str, sight: Sight, front_m: tuple[float, float, float]) -> bool:
+        """Whether a vehicle is on the ego's level and in sight."""
         x_m, y_m, z_m = sight[constants.VAR_POSITION3D]
         distance_m = math.hypot(x_m - front_m[0], y_m - front_m[1])
-        if sight[constants.VAR_STOPSTATE] & _PARKS:
-            return False
         if self._any_long:
             size_m = self._kinds.of(vehicle_id).size_m
             if size_m[0] > LONG_M:
@@ -343,13 +354,13 @@ class SumocfgSimulation(Simulation):
 
     def _nearest(self, seen: Mapping[str, Sight], front_m: tuple[float, float, float]) -> dict[str, Sight]:
         """Return as many vehicles as there are slots, nearest first."""
-
-        def distance_m(vehicle_id: str) -> float:
-            if vehicle_id in self._long:
-                return self._long[vehicle_id].distance_m
-            return math.dist(seen[vehicle_id][constants.VAR_POSITION3D][:2], front_m[:2])
-
-        nearest = sorted(seen, key=distance_m)
+        ego_x_m, ego_y_m, _ = front_m
+        away_m = {}
+        for vehicle_id, sight in seen.items():
+            x_m, y_m, _ = sight[constants.VAR_POSITION3D]
+            long = self._long.get(vehicle_id)
+            away_m[vehicle_id] = long.distance_m if long else math.hypot(x_m - ego_x_m, y_m - ego_y_m)
+        nearest = sorted(away_m, key=away_m.__getitem__)
         return {vehicle_id: seen[vehicle_id] for vehicle_id in nearest[: self.scene.max_vehicles]}
 
     def _follow(self, near: Mapping[str, Sight]) -> None:
@@ -358,15 +369,18 @@ class SumocfgSimulation(Simulation):
         slots.begin_step()
         for vehicle_id in self.slot.keys() - near.keys():
             slots.leave(0, self.slot.pop(vehicle_id))
+        placed, seen = [], []
         for vehicle_id, sight in near.items():
             slot = self.slot[vehicle_id] if vehicle_id in self.slot else self._take(vehicle_id)
             if slot != NO_VEHICLE:
-                slots.front_m[0, slot] = sight[constants.VAR_DISTANCE]
-                if vehicle_id in self._long:
-                    slots.box[0, slot] = self._long[vehicle_id].nearest_box
-                else:
-                    size_m = slots.length_m.item(0, slot), slots.width_m.item(0, slot)
-                    slots.box[0, slot] = box_of(sight, size_m, self.origin_m)
+                x_m, y_m, _ = sight[constants.VAR_POSITION3D]
+                placed.append(slot)
+                seen.append((x_m, y_m, sight[constants.VAR_ANGLE], sight[constants.VAR_DISTANCE]))
+        if placed:
+            place_seen(np.array(placed), np.array(seen), *self.origin_m, slots.front_m[0], slots.box[0])
+        for vehicle_id, body in self._long.items():
+            if vehicle_id in self.slot:
+                slots.box[0, self.slot[vehicle_id]] = body.nearest_box
 
     def _take(self, vehicle_id: str) -> int:
         """Return the slot that a vehicle takes; ``NO_VEHICLE`` if none is free."""

@@ -21,7 +21,8 @@ from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation.connection import LOAD_STATE, SUMO_ERRORS, Connection
 from tint_sumo.simulation.refusals import one_line
 
-_CHOICE, _STATE = 2, 3  # what is drawn from a seed: the number of a state; and from the number of a state: its traffic
+# What is drawn from a seed: the number of a state, and the time of a warm-up. From the number of a state: its traffic.
+_CHOICE, _STATE, _TIME = 2, 3, 4
 _SAME_M = 0.01  # vehicles and persons of a loaded state are at most so far from where they were
 _SAVING = {
     "save-state.rng": "false",  # whoever loads it has other random numbers
@@ -57,7 +58,7 @@ class WarmStarts:
         """
         state = self._state_of(seed) if self.scene.warm_starts else None
         if state is None:
-            self._warm_up(self.run.options(seed))
+            self._warm_up(seed, self.run.options(seed))
         else:
             self._load_state(seed, state)
 
@@ -73,15 +74,17 @@ class WarmStarts:
         """Save a state; return its file, or None if SUMO does not load what it has saved."""
         file = self.run.output / f"{number}.xml"
         seed = (number, _STATE)
-        self._warm_up(self.run.options(seed, more=_SAVING))
+        self._warm_up(seed, self.run.options(seed, more=_SAVING))
         self.connection.simulation.saveState(file.name)  # SUMO puts it into the folder for output
         saved = self._positions()
         self._load_state(seed, file)
         return file if _are_same(saved, self._positions()) else None
 
-    def _warm_up(self, options: list[str]) -> None:
+    def _warm_up(self, seed: int | tuple[int, ...], options: list[str]) -> None:
+        seeds = (seed, _TIME) if isinstance(seed, int) else (*seed, _TIME)
+        longer_s = np.random.default_rng(seeds).uniform(0.0, self.scene.warm_up_spread_s)
         self.connection.load(options)
-        self.connection.step(self.connection.simulation.getTime() + self.scene.warm_up_s)
+        self.connection.step(self.connection.simulation.getTime() + self.scene.warm_up_s + longer_s)
 
     def _load_state(self, seed: int | Sequence[int], file: Path) -> None:
         try:

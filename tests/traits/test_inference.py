@@ -13,12 +13,13 @@ from tint_sumo.dataset.schema import TRAJECTORIES
 from tint_sumo.dataset.windows import load_windows
 from tint_sumo.traits import TRAIT_METHODS, load
 from tint_sumo.traits.evaluation import encode_windows
-from tint_sumo.traits.inference import infer_traits, write_table
+from tint_sumo.traits.inference import infer_traits, outside_lines, write_table
 from tint_sumo.traits.storage import save
 from tint_sumo.traits.streaming import evidence, posterior
 
 NET = shipped("sumo_net") / "tint.net.xml"
 KEYS = ["vehicle", "window", "start_s", "end_s", "steps", "has_leader"]
+OUTSIDE_COLUMNS = ["outside", "outside_input", "outside_step", "outside_m", "trained_low_m", "trained_high_m"]
 LATENTS, STDS = ["latent_1", "latent_2"], ["std_1", "std_2"]
 
 
@@ -46,7 +47,7 @@ def test_a_dataset_gives_the_latents_of_its_windows(dataset: Path) -> None:
     expected = encode_windows(load("vae"), windows)
     np.testing.assert_allclose(table[LATENTS], expected.mean, atol=1e-5)
     np.testing.assert_allclose(table[STDS], expected.std, rtol=1e-4)
-    assert list(table) == [*KEYS, *LATENTS, *STDS, "outside"]
+    assert list(table) == [*KEYS, *LATENTS, *STDS, *OUTSIDE_COLUMNS]
     assert table["outside"].mean() < 0.01
     np.testing.assert_array_equal(table["steps"], windows.length)
     np.testing.assert_allclose(table["end_s"] - table["start_s"], 0.1 * (table["steps"] - 1), atol=1e-3)
@@ -115,3 +116,19 @@ def test_tables_come_back_as_they_were(tmp_path: Path, dataset: Path, suffix: st
         found.drop(columns="vehicle"), table.drop(columns="vehicle"), check_dtype=False, rtol=1e-6
     )
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
+
+
+def test_inputs_that_the_training_had_not_are_named(tmp_path: Path) -> None:
+    steps = "".join(
+        f'<timestep time="{time:.1f}"><vehicle id="a" lane="e_0" pos="{30 * time:.2f}" speed="30.00"/></timestep>'
+        for time in np.arange(0.0, 1.95, 0.1)
+    )
+    (tmp_path / "fcd.xml").write_text(f"<fcd-export>{steps}</fcd-export>")
+    table = infer_traits(tmp_path / "fcd.xml", "vae")
+    (row,) = table[OUTSIDE_COLUMNS].to_dict("records")
+    assert (row["outside"], row["outside_input"], row["outside_step"]) == (True, "offset", 20)
+    assert row["outside_m"] == pytest.approx(0.1 * 30.0 * 19, abs=0.1)
+    assert 0.0 <= row["trained_low_m"] < row["trained_high_m"] < 10.0
+    (line,) = outside_lines(table)
+    assert line.startswith("  offset: 100.0% of the windows, such as 57.0 m at step 20 of vehicle a's window at 0.0 s;")
+    assert line.endswith(" m there")

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tint_sumo.config import WINDOW_STEPS
-from tint_sumo.dataset.windows import Windows
+from tint_sumo.dataset.windows import Windows, joined
 from tint_sumo.traits.input_range import MARGIN_M, InputRange
 from tint_sumo.traits.storage import read_card
 
@@ -55,3 +55,17 @@ def test_shipped_models_know_theirs(name: str) -> None:
     assert reach is not None
     assert not reach.outside(windows_of(2.5, 8.0)).any()
     assert reach.outside(windows_of(30.0, 8.0)).all()
+
+
+def test_the_input_that_is_the_farthest_outside_is_named() -> None:
+    windows = joined([windows_of(3.0, 5.0), windows_of(9.0, 5.0), windows_of(3.0, 12.0, length=4)])
+    table = REACH.farthest_outside(windows)
+    assert table["outside"].tolist() == [False, True, True]
+    assert table["outside_input"].tolist() == ["none", "offset", "gap"]
+    assert table["outside_step"].tolist() == [0, 20, 1]
+    np.testing.assert_allclose(table["outside_m"], [np.nan, 0.1 * 9.0 * 19, 12.0], atol=1e-3)
+    np.testing.assert_allclose(table["trained_high_m"], [np.nan, 0.1 * 4.0 * 19, 10.0], atol=1e-3)
+    np.testing.assert_allclose(table["trained_low_m"], [np.nan, 0.1 * 2.0 * 19, 3.0], atol=1e-3)
+    longer = InputRange.of([windows_of(2.0, 3.0, length=4)]).farthest_outside(windows_of(2.0, 3.0, length=5))
+    assert longer[["outside_input", "outside_step"]].to_numpy().tolist() == [["offset", 5]]
+    assert np.isnan(longer["trained_high_m"]).all()

@@ -155,7 +155,7 @@ class InferTraits(Command):
     vtypes: Annotated[Path | None, _VTYPES] = None
 
     def run(self) -> Outcome:
-        from tint_sumo.traits.inference import OUTSIDE, SUFFIXES, infer_traits, write_table
+        from tint_sumo.traits.inference import OUTSIDE, SUFFIXES, infer_traits, outside_lines, write_table
 
         if self.out.exists() and self.fcd.exists() and self.out.samefile(self.fcd):
             raise InputError(f"{self.out} holds the data themselves; choose another --out")
@@ -169,7 +169,9 @@ class InferTraits(Command):
         content = {"out": str(self.out), "windows": len(table), "vehicles": int(table["vehicle"].nunique())}
         reach = "how many are outside is not known, since the model's card does not say what it was trained on"
         if outside is not None:
-            reach = f"{percent(outside)}% of the windows lie outside what the model was trained on"
+            reach = "\n".join(
+                [f"{percent(outside)}% of the windows lie outside what the model was trained on", *outside_lines(table)]
+            )
         text = f"{content['windows']} windows of {content['vehicles']} vehicles: {self.out}\n{reach}"
         return Outcome(text, {**content, "outside": outside, "columns": list(table)})
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, STEP_S, VehicleShape
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import require_output_file, whole_file
+from tint_sumo.core.percentages import percent
 from tint_sumo.dataset.tracks import read_tracks
 from tint_sumo.dataset.windows import cut_windows, window_rows
 from tint_sumo.traits.cross_window import CrossWindow
@@ -42,7 +43,8 @@ def infer_traits(
         step), latent_1, ... and std_1, ... (mean and standard deviation of the window's posterior). Of
         ``cross_window``, also fused_latent_1, ... and fused_std_1, ...: what the vehicle's windows say together, up
         to this one. If the model's card knows the range of its training's inputs, also outside: whether the window has
-        a step whose offset or gap no training window had.
+        a step whose offset or gap no training window had; and which of them is the farthest beyond
+        (``tint_sumo.traits.input_range.InputRange.farthest_outside``).
 
     Raises:
         InputError: unusable data, network, length or model.
@@ -68,9 +70,26 @@ def infer_traits(
             "has_leader": windows.has_leader,
             **_columns("", latents),
             **(_columns("fused_", fuse_so_far(latents, vehicle.codes)) if isinstance(trained, CrossWindow) else {}),
-            **({} if reach is None else {OUTSIDE: reach.outside(windows)}),
+            **({} if reach is None else dict(reach.farthest_outside(windows))),
         }
     )
+
+
+def outside_lines(table: pd.DataFrame) -> list[str]:
+    """Return a line for each input that is the farthest outside in some windows, with the farthest of its values."""
+    lines = []
+    for name, part in table[table[OUTSIDE]].groupby("outside_input"):
+        low_m, high_m, found_m = (part[key].to_numpy() for key in ("trained_low_m", "trained_high_m", "outside_m"))
+        beyond_m = np.nan_to_num(np.maximum(low_m - found_m, found_m - high_m), nan=np.inf)
+        worst = part.iloc[int(beyond_m.argmax())]
+        trained = f"the training had {worst['trained_low_m']:.1f} to {worst['trained_high_m']:.1f} m there"
+        if np.isnan(worst["trained_low_m"]):
+            trained = "no window of the training is so long"
+        lines.append(
+            f"  {name}: {percent(len(part) / len(table))}% of the windows, such as {worst['outside_m']:.1f} m at step "
+            f"{worst['outside_step']} of vehicle {worst['vehicle']}'s window at {worst['start_s']:.1f} s; {trained}"
+        )
+    return lines
 
 
 def write_table(table: pd.DataFrame, out: Path) -> None:

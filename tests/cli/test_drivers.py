@@ -47,3 +47,23 @@ def test_bad_recordings_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         *("drivers", "fit", write_pair(tmp_path / "pair.csv", simulated_pair(population(1, 0)[0]))),
         *("--min-duration", "60", "--out", tmp_path / "fit"),
     )
+
+
+def test_export_writes_vtypes_population_and_picture(fit: Path, tmp_path: Path) -> None:
+    assert main(["drivers", "export", str(fit), "--out", str(tmp_path), "--size", "3", "--speed-limit", "30"]) == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["drivers.add.xml", "drivers.png", "population.yaml"]
+    assert (tmp_path / "drivers.add.xml").read_text().count("<vType ") == 3
+
+
+def test_check_prints_the_distances(fit: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["drivers", "check", str(fit), "--recording", str(fit.parent / "recording"), "--repeats", "1", "--json"]
+    assert main(words) == 0
+    text, _, last = capsys.readouterr().out.rstrip("\n").rpartition("\n")
+    assert "createVehTypeDistribution.py" in text
+    assert json.loads(last)["repeats"] == 1
+
+
+def test_what_is_no_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["export", tmp_path, "--out", tmp_path / "out"], ["check", tmp_path, "--recording", tmp_path]):
+        assert "has no fitted.json; fit drivers first" in refuse(capsys, "drivers", *words)
+    assert not (tmp_path / "out").exists()

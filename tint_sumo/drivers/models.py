@@ -103,15 +103,21 @@ class CarFollowing:
         )
         return fronts_m, speeds_mps
 
-    def vtype(self, log_parameters: Floats) -> dict[str, str]:
-        """Return the attributes of a vType that drives so in SUMO."""
+    def vtype(self, log_parameters: Floats, speed_limit_mps: float | None = None) -> dict[str, str]:
+        """Return the attributes of a vType that drives so in SUMO.
+
+        Args:
+            log_parameters: (P,) logarithms of the parameters.
+            speed_limit_mps: of the road where they hold: the desired speed rises and falls with the limit elsewhere.
+        """
         values = dict(zip(self.parameters, np.exp(log_parameters), strict=True))
-        decel = next(value for parameter, value in values.items() if parameter.name == "decel_mps2")
+        named = {parameter.name: value for parameter, value in values.items()}
+        factor = 1.0 if speed_limit_mps is None else named["desired_speed_mps"] / speed_limit_mps
         return {
             "carFollowModel": self.name,
             **{parameter.attribute: f"{value:.6g}" for parameter, value in values.items()},
-            "emergencyDecel": f"{max(EMERGENCY_DECEL_MPS2, decel):.6g}",
-            "speedFactor": "1",
+            "emergencyDecel": f"{max(EMERGENCY_DECEL_MPS2, named['decel_mps2']):.6g}",
+            "speedFactor": f"{factor:.6g}",
             "speedDev": "0",
             **dict(self.attributes),
         }

@@ -8,14 +8,16 @@ Model, with z the logarithms of the parameters:
 * the errors of the gap, looked at once a second, follow an AR(1) process that begins at 0, with the same correlation
   and deviation for all pairs.
 
-It is fitted by expectation maximisation. In the expectation each pair's likelihood is replaced by a normal distribution
-around its mode (Laplace); all else is linear and normal, and solved exactly. Inverse Wishart priors on both covariances
-weigh as much as ``PRIOR_WEIGHT`` drivers.
+It is fitted by expectation maximisation. In the expectation each pair's likelihood is replaced by a normal
+distribution; all else is linear and normal, and solved exactly. That normal distribution is found from the mode on
+(Laplace), and then by importance sampling around it, since likelihoods are skewed: hardly any braking is too hard.
+Inverse Wishart priors on both covariances weigh as much as ``PRIOR_WEIGHT`` drivers.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -33,6 +35,10 @@ _FIRST_NOISE = (0.9, 3.0)  # correlation, and deviation in m
 _MOST_ITERATIONS = 20
 _SETTLED = 0.02  # change of means and of logarithms of spreads from which the fit is finished
 _MOST_TRIES = 40
+_POINTS = 256  # at which a pair's posterior is looked at
+_FREEDOM = 6.0  # degrees of the t distribution from which they are drawn
+_LEAST_PRECISION, _LEAST_VARIANCE = 1e-6, 1e-9
+_TRIES = 20  # draws for each one that is wanted, of which some are out of bounds
 _LEAST_DEVIATION_M = 0.01  # in recordings of our simulations the model is exact
 
 
@@ -71,7 +77,7 @@ class Population:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a pair says about its parameters: a normal distribution in natural form."""
+    """What a pair says about its parameters: a normal distribution by its precision."""
 
     mode: Floats  # (P,) with the prior
     precision: Floats  # (P, P)
@@ -89,7 +95,11 @@ def prior(model: CarFollowing) -> Population:
 
 
 def evidence(model: CarFollowing, pair: Pair, population: Population, starts: Sequence[Floats]) -> Evidence:
-    """Find what a pair says, from its mode among a population on (Laplace).
+    """Find what a pair says about its parameters.
+
+    The pair's posterior among the population has a mode and a curvature there (Laplace). Points are drawn from a t
+    distribution of that form, and weighted with the posterior; the normal distribution with their mean and covariance,
+    divided by that of the population, is what the pair says.
 
     Args:
         model: car-following model.
@@ -113,11 +123,42 @@ def evidence(model: CarFollowing, pair: Pair, population: Population, starts: Se
         )
         for start in starts
     ]
-    mode = min(found, key=lambda result: float(result.cost)).x
-    slope = slopes(mode)[: -len(mode)]
-    precision = slope.T @ slope
-    # With the prior the mode is the mean, also where a bound holds it.
-    return Evidence(mode, precision, precision @ mode + root.T @ root @ (mode - population.mean))
+    best = min(found, key=lambda result: float(result.cost))
+    slope = slopes(best.x)
+    curvature: Floats = slope.T @ slope
+    points, log_density = _around(best.x, curvature)
+    log_weights = np.full(len(points), -np.inf)
+    for index in np.flatnonzero(((points >= model.low) & (points <= model.high)).all(axis=1)):
+        error = errors(points[index])
+        log_weights[index] = -float(error @ error) / 2.0 - log_density[index]
+    mean, covariance = _weighted_moments(points, log_weights)
+    # The pair's share of this posterior is that which the population does not explain, and never less than nothing.
+    alone = root.T @ root
+    values, vectors = np.linalg.eigh(np.linalg.inv(covariance) - alone)
+    precision = (vectors * np.maximum(values, _LEAST_PRECISION)) @ vectors.T
+    return Evidence(best.x, precision, precision @ mean + alone @ (mean - population.mean))
+
+
+def _around(mode: Floats, precision: Floats) -> tuple[Floats, Floats]:
+    """Return points from a t distribution, always from the same draws, and log densities but for a constant."""
+    standard = _standard_draws(len(mode))
+    log_density = -(_FREEDOM + len(mode)) / 2.0 * np.log1p((standard**2).sum(axis=1) / _FREEDOM)
+    return mode + standard @ np.linalg.cholesky(np.linalg.inv(precision)).T, log_density
+
+
+@cache
+def _standard_draws(count: int) -> Floats:
+    rng = np.random.default_rng(0)
+    return rng.standard_normal((_POINTS, count)) / np.sqrt(rng.chisquare(_FREEDOM, (_POINTS, 1)) / _FREEDOM)
+
+
+def _weighted_moments(points: Floats, log_weights: Floats) -> tuple[Floats, Floats]:
+    """Return mean and covariance matrix of weighted points."""
+    weights = np.exp(log_weights - log_weights.max())
+    weights /= weights.sum()
+    mean = weights @ points
+    off = points - mean
+    return mean, (off * weights[:, None]).T @ off + _LEAST_VARIANCE * np.eye(len(mean))
 
 
 def posterior(population: Population, found: Sequence[Evidence]) -> Estimate:
@@ -140,10 +181,11 @@ def next_pair(population: Population, driver: Estimate) -> Estimate:
 
 
 def draws(model: CarFollowing, known: Estimate, count: int, seed: int) -> Floats:
-    """Draw parameters within their bounds; (count, P) logarithms."""
+    """Draw parameters from the part of a distribution that lies within their bounds; (count, P) logarithms."""
     rng = np.random.default_rng(seed)
-    drawn = rng.multivariate_normal(known.log_parameters, known.covariance, count, method="cholesky")
-    return np.clip(drawn, model.low, model.high)
+    drawn = rng.multivariate_normal(known.log_parameters, known.covariance, _TRIES * count, method="cholesky")
+    inside_first = np.argsort(((drawn < model.low) | (drawn > model.high)).any(axis=1), kind="stable")
+    return np.clip(drawn[inside_first[:count]], model.low, model.high)
 
 
 def predicted_gap_m(model: CarFollowing, pair: Pair, known: Estimate, count: int = 200, seed: int = 0) -> Floats:

@@ -37,7 +37,7 @@ OBSERVATION_BOUND = 2.0  # of normalised observations: 40 m, 6 m/s
 Backend = Literal["auto", "libsumo", "traci"]
 EgoControl = Literal["speed", "sumo"]
 RedLight = Literal["ignore", "cost", "end"]
-Perceivable = Literal["traffic_light", "speed_limit", "lane"]
+Perceivable = Literal["traffic_light", "right_of_way", "speed_limit", "lane", "pedestrians"]
 
 # Numbers that several settings have, with what is sensible; larger ones would fill the memory, or are mistakes.
 Fraction = Annotated[float, Range(0.0, 1.0)]

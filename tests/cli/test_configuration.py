@@ -24,6 +24,7 @@ from tint_sumo.study.plan import plan, run_study
 COMMAND_LINES = (
     "net --replicas 3 --scene four_way --out some/net",
     "scene check mine.sumocfg --ego-route in out --start-m 3.5 --goal-m 90 --figure picture.svg",
+    "scene check mine.sumocfg --ego-route in out --goal-m 90 --perceives lane pedestrians --red-light end",
     "record --out data --windows 70 --p-conservative 0.2 0.8 --population continuous --format fcd --json",
     "record --out data --sumocfg mine.sumocfg",
     "record --out s3://bucket/data --executor ray --address ray://head:10001",

@@ -11,10 +11,10 @@ from stable_baselines3.common.env_checker import check_env
 
 from tests.envs.test_environments import assert_equal
 from tests.scenes.networks import lights
-from tint_sumo.config import Perceivable
+from tint_sumo.config import Perceivable, Sensor
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
-from tint_sumo.envs.perceived import PERCEIVED
+from tint_sumo.envs.perceived import perceived_in, perceived_spaces
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.envs.scene_env import SceneEnv
 from tint_sumo.envs.vector import SceneVectorEnv
@@ -30,7 +30,7 @@ RED, GREEN = "r", "G"
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> SumocfgScene:
     """Two crossings with lights, in steps of 0.5 s."""
-    return lights(tmp_path_factory.mktemp("lights"), 0.5).scene(warm_up_s=10.0, time_limit_s=40.0)
+    return lights(tmp_path_factory.mktemp("lights"), 0.5).scene(warm_up_s=10.0, time_limit_s=40.0, sight_m=100.0)
 
 
 def set_all(env: SceneEnv, state: str) -> None:
@@ -58,7 +58,7 @@ def test_observations_have_the_keys_that_are_asked_for_and_are_as_ever_otherwise
         closing(SceneEnv(TaskSettings(replace(scene, perceives=ALL)))) as rich,
     ):
         assert set(plain.observation_space.spaces) == set(BUILT_IN_KEYS)
-        added = [key for name in ALL for key in PERCEIVED[name].spaces]
+        added = perceived_spaces(ALL, 12)
         assert set(rich.observation_space.spaces) == {*BUILT_IN_KEYS, *added}
         few, many = plain.reset(seed=3)[0], rich.reset(seed=3)[0]
         actions = np.random.default_rng(3).integers(3, size=30)
@@ -71,7 +71,7 @@ def test_observations_have_the_keys_that_are_asked_for_and_are_as_ever_otherwise
 
 
 def test_values_are_those_of_sumo_in_the_units_that_are_documented(scene: SumocfgScene) -> None:
-    seen = set()
+    seen, first = set(), False
     with closing(SceneEnv(TaskSettings(replace(scene, perceives=ALL, red_light="ignore")))) as env:
         for seed in range(3):
             observation, _ = env.reset(seed=seed)
@@ -82,6 +82,14 @@ def test_values_are_those_of_sumo_in_the_units_that_are_documented(scene: Sumocf
                 assert observation["speed_limit"] == pytest.approx(min(connection.lane.getMaxSpeed(lane) / 10.0, 2.0))
                 edge, index = lane.rsplit("_", 1)
                 assert observation["lane"].tolist() == [float(index), connection.edge.getLaneNumber(edge)]
+                links = connection.vehicle.getNextLinks(EGO)
+                if links and not lane.startswith(":"):
+                    left_m = connection.lane.getLength(lane) - connection.vehicle.getLanePosition(EGO)
+                    expected = [float(links[0][5] not in "MGOY"), min(left_m / 20.0, 5.0)]
+                    assert observation["right_of_way"] == pytest.approx(expected, abs=1e-5)
+                assert (observation["priority"] <= observation["mask"]).all()
+                first |= bool(observation["priority"].any())
+                assert not observation["pedestrian_mask"].any(), "nobody is on foot here"
                 state, (distance, time) = observation["traffic_light"][:6], observation["traffic_light"][6:]
                 if upcoming:
                     _, _, distance_m, letter = upcoming[0]
@@ -96,6 +104,7 @@ def test_values_are_those_of_sumo_in_the_units_that_are_documented(scene: Sumocf
                 ended = terminated or truncated
             assert env.observation_space.contains(observation)
     assert seen >= {"r", ""}
+    assert first, "somebody had priority"
 
 
 def test_they_are_the_same_in_vectors_with_workers(scene: SumocfgScene) -> None:
@@ -178,6 +187,25 @@ def test_scenes_of_one_vector_must_observe_the_same(scene: SumocfgScene) -> None
     tasks = [TaskSettings(scene), TaskSettings(replace(scene, perceives=("lane",)))]
     with pytest.raises(InputError, match="must have the same `perceives` and `red_light`"):
         SceneVectorEnv(2, tasks)
+
+
+def test_names_are_found_by_their_keys() -> None:
+    for names in ((), ("lane",), ("right_of_way", "pedestrians"), ALL):
+        assert perceived_in([*BUILT_IN_KEYS, *perceived_spaces(names, 3)]) == names
+
+
+def test_priorities_are_delayed_with_their_slots(scene: SumocfgScene) -> None:
+    watchful = replace(scene, perceives=("right_of_way",))
+    found = []
+    for sensor in (Sensor(), Sensor(delay_s=1.0)):
+        with closing(SceneEnv(TaskSettings(watchful, sensor=sensor))) as env:
+            first = env.reset(seed=1)[0]
+            found.append([first, *(env.step(0)[0] for _ in range(40))])
+    for step, late in enumerate(found[1]):
+        for key in ("priority", "mask", "vehicles"):
+            np.testing.assert_array_equal(late[key], found[0][max(step - 2, 0)][key])
+        np.testing.assert_array_equal(late["right_of_way"], found[0][step]["right_of_way"])
+    assert any(one["priority"].any() for one in found[0])
 
 
 def test_names_are_put_in_order_and_each_once(scene: SumocfgScene) -> None:

@@ -112,7 +112,7 @@ def test_what_is_observed_of_the_road_has_influence_and_is_the_last_input() -> N
     torch.manual_seed(0)
     without = AttentionExtractor(STREET_WITH_TRAITS)
     torch.manual_seed(0)
-    road = perceived_spaces(("traffic_light", "lane"))
+    road = perceived_spaces(("traffic_light", "lane"), 12)
     extractor = AttentionExtractor(spaces.Dict({**STREET_WITH_TRAITS.spaces, **road}))
     assert [one.shape for one in without.embed.parameters()] == [one.shape for one in extractor.embed.parameters()]
     assert extractor.joint[0].in_features == without.joint[0].in_features + 8 + 2  # type: ignore[operator, union-attr]
@@ -123,6 +123,32 @@ def test_what_is_observed_of_the_road_has_influence_and_is_the_last_input() -> N
     features = extractor(observations)
     assert not torch.equal(extractor({**observations, "traffic_light": red}), features)
     assert not torch.equal(extractor({**observations, "lane": 2 * lane}), features)
+
+
+def test_priorities_belong_to_vehicles_and_pedestrians_have_no_order() -> None:
+    torch.manual_seed(0)
+    road = perceived_spaces(("right_of_way", "pedestrians"), 12)
+    extractor = AttentionExtractor(spaces.Dict({**STREET_WITH_TRAITS.spaces, **road}))
+    random = torch.Generator().manual_seed(1)
+    observations = {
+        **scene(6),
+        "right_of_way": torch.rand(6, 2, generator=random),
+        "priority": (torch.rand(6, 12, generator=random) < 0.5).float(),
+        "pedestrians": torch.randn(6, 8, 4, generator=random),
+        "pedestrian_mask": (torch.arange(8) < torch.tensor([[0], [1], [3], [5], [8], [8]])).float(),
+    }
+    features = extractor(observations)
+    order = torch.randperm(12, generator=random)
+    turned = {key: observations[key][:, order] for key in ("vehicles", "mask", "traits", "priority")}
+    torch.testing.assert_close(extractor({**observations, **turned}), features)
+    turned = {key: observations[key].flip(1) for key in ("pedestrians", "pedestrian_mask")}
+    torch.testing.assert_close(extractor({**observations, **turned}), features)
+    nobody = (1.0 - observations["pedestrian_mask"]).unsqueeze(-1)
+    ghosts = {"pedestrians": observations["pedestrians"] + 9.0 * nobody}
+    torch.testing.assert_close(extractor({**observations, **ghosts}), features)
+    for key in ("priority", "pedestrians", "right_of_way"):
+        changed = extractor({**observations, key: observations[key] + 1.0})
+        assert not torch.equal(changed[-1], features[-1]), key
 
 
 def test_attention_sums_to_one(extractor: AttentionExtractor) -> None:

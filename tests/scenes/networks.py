@@ -36,18 +36,16 @@ _LIGHTS_ROUTES = """<routes>
     <flow id="oncoming" type="car" from="right0B0" to="A0left0" begin="0" end="3600" period="exp(0.2)"/>
 </routes>
 """
-_MERGE_NODES = """<nodes>
+_MERGE_NODES = """
     <node id="west" x="0" y="0"/>
     <node id="middle" x="150" y="0" type="priority"/>
     <node id="east" x="300" y="0"/>
     <node id="south" x="60" y="-60"/>
-</nodes>
 """
-_MERGE_EDGES = """<edges>
+_MERGE_EDGES = """
     <edge id="in" from="west" to="middle" numLanes="2" speed="13.9" priority="3"/>
     <edge id="ramp" from="south" to="middle" numLanes="1" speed="13.9" priority="1"/>
     <edge id="out" from="middle" to="east" numLanes="2" speed="13.9" priority="3"/>
-</edges>
 """
 _MERGE_ROUTES = """<routes>
     <vTypeDistribution id="people">
@@ -100,10 +98,7 @@ def grid(folder: Path) -> UserNetwork:
 
 
 def merge(folder: Path) -> UserNetwork:
-    (folder / "merge.nod.xml").write_text(_MERGE_NODES)
-    (folder / "merge.edg.xml").write_text(_MERGE_EDGES)
-    files = ("-n", str(folder / "merge.nod.xml"), "-e", str(folder / "merge.edg.xml"))
-    _run("netconvert", *files, "-o", str(folder / "merge.net.xml"))
+    netconvert(folder, _MERGE_NODES, _MERGE_EDGES, "merge")
     (folder / "merge.rou.xml").write_text(_MERGE_ROUTES)
     step = '<step-length value="0.1"/>'
     sumocfg = write_config(folder / "merge.sumocfg", "merge.net.xml", "merge.rou.xml", step)
@@ -131,6 +126,15 @@ def lights(folder: Path, step_s: float = 0.1, program: str = "") -> UserNetwork:
 USER_NETWORKS: dict[str, Callable[[Path], UserNetwork]] = {
     one.__name__: one for one in (braunschweig, autobahn, grid, merge)
 }
+
+
+def netconvert(folder: Path, nodes: str, edges: str, name: str = "x") -> Path:
+    """Write a network of these nodes and edges, in SUMO's XML, into a folder; return its file."""
+    (folder / f"{name}.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (folder / f"{name}.edg.xml").write_text(f"<edges>{edges}</edges>")
+    net = folder / f"{name}.net.xml"
+    _run("netconvert", "-n", str(folder / f"{name}.nod.xml"), "-e", str(folder / f"{name}.edg.xml"), "-o", str(net))
+    return net
 
 
 def write_config(file: Path, net: str, routes: str, more: str = "") -> Path:

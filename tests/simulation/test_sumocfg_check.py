@@ -85,7 +85,7 @@ def test_persons_and_roads_without_conflicts_are_named(tmp_path: Path) -> None:
     found = check_sumocfg(write_config(tmp_path / "r.sumocfg", "r.net.xml", "r.rou.xml"))
     assert (found.traffic.persons, found.traffic.vehicles, found.routes) == (1, {"DEFAULT_VEHTYPE": 1}, ())
     page = report(found)
-    assert "not supported     persons" in page
+    assert "limits            persons are not observed, but the ego can hit them" in page
     assert page.endswith("meets others at no junction; any edges that follow each other will do as its route")
     plot_check(found, tmp_path / "picture.svg")
     assert (tmp_path / "picture.svg").read_text().startswith("<?xml")
@@ -99,11 +99,17 @@ def test_the_command_prints_a_page_whose_flags_can_be_copied(
     page = capsys.readouterr().out
     assert len(page.splitlines()) < 40
     assert "traffic lights    1\n" in page
-    assert "not supported     traffic lights: others obey them; the ego sees none" in page
+    assert "limits            traffic lights are not observed" in page
+    assert "limits            the ego may drive through red" in page
     flags = [line.strip()[1:] for line in page.splitlines() if "--ego-route=" in line]
     assert len(flags) == 3
     assert main(["scene", "check", sumocfg, *shlex.split(flags[0])]) == 0
     assert "ego               starts at" in capsys.readouterr().out
+    watchful = ("--perceives", "traffic_light", "--red-light", "cost")
+    assert main(["scene", "check", sumocfg, *shlex.split(flags[0]), *watchful]) == 0
+    assert "limits" not in capsys.readouterr().out
+    assert main(["scene", "check", sumocfg, *watchful]) == 2
+    assert "--perceives and --red-light are the ego's; add its --ego-route" in capsys.readouterr().err
     assert main(["scene", "check", sumocfg, *shlex.split(flags[1]), "--json"]) == 0
     assert "38" in json.loads(capsys.readouterr().out.splitlines()[-1])["passed"]
     image = matplotlib.image.imread(picture)

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 from tint_sumo.cli.command import Command, flag_of
-from tint_sumo.cli.values import EGO_ROUTE_HELP, edges_of, optional
+from tint_sumo.cli.values import EGO_ROUTE_HELP, PERCEIVES, RED_LIGHT, edges_of, optional
 from tint_sumo.config import EgoController, Perceivable, RedLight, RouteM, SpeedMps, TimeS, WarmStarts, WarmUpS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.structures import Many
@@ -28,16 +28,6 @@ _WARM_STARTS = optional(
     "0, each episode has its own",
 )
 _TIME_LIMIT = optional("FLOAT", "Longest time of an episode, s; with --sumocfg.", "50")
-_PERCEIVES = optional(
-    "KEY [KEY ...]",
-    f"Further keys of the observation: {', '.join(get_args(Perceivable))}; with --sumocfg.",
-)
-_RED_LIGHT = optional(
-    "ignore|cost|end",
-    "What follows if the ego drives over a stop line at red: nothing, a cost (1 is taken from the reward), or the end "
-    "of the episode with the reward of a collision; with --sumocfg.",
-    "ignore",
-)
 _TASK = (
     *("ego_route", "start_m", "goal_m", "speeds_mps", "warm_up_s", "warm_up_spread_s", "warm_starts"),
     *("time_limit_s", "perceives", "red_light"),
@@ -57,8 +47,8 @@ class NetworkCommand(Command):
     warm_up_spread_s: Annotated[WarmUpS | None, _SPREAD] = None
     warm_starts: Annotated[WarmStarts | None, _WARM_STARTS] = None
     time_limit_s: Annotated[TimeS | None, _TIME_LIMIT] = None
-    perceives: Annotated[Many[Perceivable] | None, _PERCEIVES] = None
-    red_light: Annotated[RedLight | None, _RED_LIGHT] = None
+    perceives: Annotated[Many[Perceivable] | None, PERCEIVES] = None
+    red_light: Annotated[RedLight | None, RED_LIGHT] = None
 
     def scene_of(self, scene: Any) -> Any:
         """Return the scene of --sumocfg and the flags that go with it; otherwise the value of --scene.

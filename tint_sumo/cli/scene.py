@@ -7,8 +7,8 @@ from typing import Annotated
 from tyro.conf import Positional, Suppress, subcommand
 
 from tint_sumo.cli.command import Command, Outcome, wrote
-from tint_sumo.cli.values import EGO_ROUTE_HELP, edges_of, optional
-from tint_sumo.config import RouteM
+from tint_sumo.cli.values import EGO_ROUTE_HELP, PERCEIVES, RED_LIGHT, edges_of, optional
+from tint_sumo.config import Perceivable, RedLight, RouteM
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import PICTURE_SUFFIXES, require_output_file
 from tint_sumo.core.structures import Many
@@ -27,6 +27,8 @@ class CheckScene(Command):
     ego_route: Annotated[Many[str] | None, _EGO_ROUTE] = None
     start_m: Annotated[RouteM | None, _START] = None
     goal_m: Annotated[RouteM | None, _GOAL] = None
+    perceives: Annotated[Many[Perceivable] | None, PERCEIVES] = None
+    red_light: Annotated[RedLight | None, RED_LIGHT] = None
     figure: Annotated[Path | None, optional("FILE", "Picture to write: .png, .jpg, .webp, .svg or .pdf.")] = None
 
     def run(self) -> Outcome:
@@ -40,9 +42,18 @@ class CheckScene(Command):
         if self.ego_route is not None:
             if self.goal_m is None:
                 raise InputError("--ego-route needs --goal-m, the position at which the ego has arrived; add it")
-            scene = from_sumocfg(self.sumocfg, edges_of(self.ego_route), self.start_m or 0.0, self.goal_m)
+            scene = from_sumocfg(
+                self.sumocfg,
+                edges_of(self.ego_route),
+                self.start_m or 0.0,
+                self.goal_m,
+                perceives=self.perceives or (),
+                red_light=self.red_light or "ignore",
+            )
         elif self.start_m is not None or self.goal_m is not None:
             raise InputError("--start-m and --goal-m are positions on --ego-route; add it")
+        elif self.perceives is not None or self.red_light is not None:
+            raise InputError("--perceives and --red-light are the ego's; add its --ego-route and --goal-m")
         found = check_sumocfg(self.sumocfg, scene)
         text = report(found)
         if self.figure is not None:

@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from tyro.conf import arg
 
 from tint_sumo import ENV_IDS
 from tint_sumo.cli.configuration import FromFile, name_flag, one_of
-from tint_sumo.config import POPULATIONS, SENSORS, Fraction, TauS
+from tint_sumo.config import POPULATIONS, SENSORS, Fraction, Perceivable, TauS
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import Many, Where, choose
 
@@ -24,6 +24,18 @@ SCENES = ", ".join(ENV_IDS)
 
 
 EGO_ROUTE_HELP = 'Edges that the ego drives along, one after the other (with a minus: --ego-route="-E1 -E2")'
+
+
+PERCEIVES = optional(
+    "KEY [KEY ...]",
+    f"Further perceptions of the ego: {', '.join(get_args(Perceivable))}; with --ego-route.",
+)
+RED_LIGHT = optional(
+    "ignore|cost|end",
+    "Consequence of driving over a stop line at red: none, a cost (1 is taken from the reward), or the episode's end "
+    "with the reward of a collision; with --ego-route.",
+    "ignore",
+)
 
 
 def edges_of(words: Sequence[str]) -> list[str]:

@@ -26,7 +26,9 @@ from tint_sumo.config import (
 )
 from tint_sumo.core.errors import InputError, find_named, shown
 from tint_sumo.core.ranges import require_ranges
+from tint_sumo.envs.pedestrians import PedestrianSensing
 from tint_sumo.envs.perceived import (
+    Road,
     add_up_red_lights,
     judge_red_lights,
     observe_road,
@@ -155,7 +157,7 @@ class TaskSettings:
             return Contents(slot_infos=slot_infos)
         red_light = self.scene.red_light
         return Contents(
-            (*OBSERVATION_KEYS, *perceived_spaces(self.scene.perceives)),
+            (*OBSERVATION_KEYS, *perceived_spaces(self.scene.perceives, 1)),
             slot_infos,
             REWARD_TERMS if red_light == "ignore" else (*REWARD_TERMS, RED_LIGHT_TERM),
             (COST,) if red_light == "cost" else (),
@@ -210,7 +212,7 @@ def observation_space(max_vehicles: int, perceives: Iterable[Perceivable] = ()) 
             "ego": spaces.Box(-BOUND, BOUND, (4,), np.float32),
             "vehicles": spaces.Box(-BOUND, BOUND, (max_vehicles, 2), np.float32),
             "mask": spaces.Box(0.0, 1.0, (max_vehicles,), np.float32),
-            **perceived_spaces(perceives),
+            **perceived_spaces(perceives, max_vehicles),
         }
     )
 
@@ -293,9 +295,11 @@ class Episodes:
             (share, Sensing(task.sensor, self.simulation, scene.step_s))
             for share, task in zip(shares, all_settings, strict=True)
         ]
-        self._network: SumocfgSimulation | None = None  # the simulation of a scene whose rows have more fields
+        self._road: Road | None = None  # of a scene whose rows have more fields
         if isinstance(self.simulation, SumocfgSimulation) and perceived_fields(scene):
-            self._network = self.simulation
+            sensing = self.sensing(0)
+            pedestrians = PedestrianSensing(sensing.sensor, self.simulation)
+            self._road = Road(self.simulation, sensing.source[0], pedestrians)
 
     def begin(self, index: int, seed: int) -> None:
         """Start a new episode in an environment."""
@@ -303,6 +307,8 @@ class Episodes:
         self._parked.discard(index)
         self._clear(index)
         self.sensing(index).begin(index, seed)
+        if self._road is not None:
+            self._road.pedestrians.begin(seed)
         self._observe(slice(index, index + 1))
 
     def park(self, index: int) -> None:
@@ -338,7 +344,7 @@ class Episodes:
             before = self.rows.copy()
             any_ended |= self._step(np.where(over, 0.0, desired_mps))
             add_up(before, self.rows)
-            if self._network is not None:
+            if self._road is not None:
                 add_up_red_lights(before, self.rows)
         return any_ended
 
@@ -354,8 +360,8 @@ class Episodes:
         egos = simulation.egos
         ends = (egos.collided, egos.ran_red, egos.lost)
         any_ended = judge(egos.front_m, egos.speed_mps, *ends, self.steps, self._rules, self.rows)
-        if self._network is not None:
-            judge_red_lights(self._network, self._rules.collision, self.rows)
+        if self._road is not None:
+            judge_red_lights(self._road.simulation, self._rules.collision, self.rows)
         return any_ended
 
     def sensing(self, index: int) -> Sensing:
@@ -386,8 +392,8 @@ class Episodes:
             self._scales,
             rows,
         )
-        if self._network is not None:
-            observe_road(self._network, rows)
+        if self._road is not None:
+            observe_road(self._road, rows)
         if self.settings.tracks:
             self._observe_tracks(sensing, envs)
         if self._reveals:

@@ -18,6 +18,7 @@ Observation = dict[str, NDArray[np.float32]]
 OBSERVATION_KEYS = ("ego", "vehicles", "mask")
 TRACKS = ("position_m", "gap_m", "passed", "claimed", "to_stop_m")  # per vehicle slot, if they are asked for
 SEEN = ("vehicles", "mask", "traits", "track", "slot", *TRACKS)  # what the sensor says, and true traits that fit it
+SEEN_IN_NETWORKS = ("priority", "pedestrians", "pedestrian_mask")  # what else it says where rows have more fields
 TRUTH = ("track", "slot", "true_mask", "true_vehicles", "true_traits")  # per vehicle slot, if the sensor is not perfect
 SLOT_INFOS = ("traits", *TRACKS, *TRUTH)  # what infos can have for each vehicle slot
 REWARD_TERMS = ("goal", "collision", "speed", "step")
@@ -379,6 +380,14 @@ def show_earlier(rows: Rows, frames: Rows, steps: Numbers) -> None:
             row.passed[slot] = earlier.passed[slot]
             row.claimed[slot] = earlier.claimed[slot]
             row.to_stop_m[slot] = earlier.to_stop_m[slot]
+
+
+def show_earlier_in_networks(rows: Rows, frames: Rows, steps: Numbers) -> None:
+    """Do as ``show_earlier``, after it, with ``SEEN_IN_NETWORKS``; rows that have no such fields stay as they are."""
+    earlier = np.maximum(steps - len(frames) + 1, 0) % len(frames)
+    for field in SEEN_IN_NETWORKS:
+        if field in (rows.dtype.names or ()):
+            rows[field] = frames[field][earlier, np.arange(len(rows))]
 
 
 def copied(rows: Rows, slot_infos: Collection[str] = SLOT_INFOS) -> dict[str, NDArray[Any]]:

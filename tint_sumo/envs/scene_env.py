@@ -53,11 +53,23 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     |                 |        | then go, switched off); the distance from the ego's front to its stop line / 20 m,|
     |                 |        | up to 5 (100 m); time in this state / 10 s, up to 10 (100 s). Without one to come |
     |                 |        | the distance is 5, and all else 0                                                 |
+    | `right_of_way`  | `(2,)` | at the next junction, or the one that the ego is on: 1 if the ego's link has no   |
+    |                 |        | priority there (signs, red, the right before the left), and the distance from its |
+    |                 |        | front to the junction / 20 m, up to 5. Without one to come, 0 and 5               |
+    | `priority`      | `(V,)` | comes with `right_of_way`: 1 where the vehicle in the slot has priority over the  |
+    |                 |        | ego there by SUMO's rules: it is on its way to the junction, or on it, its way    |
+    |                 |        | meets the ego's, and its light, if any, is not red                                |
     | `speed_limit`   | `(1,)` | speed limit of the ego's lane, divided by the scale of its velocity, up to 2      |
     | `lane`          | `(2,)` | number of the ego's lane, 0 at the outer side of its edge (to the right in        |
     |                 |        | right-hand traffic), and how many lanes the edge has; on junctions of their lanes |
 
-    The ego knows them as they are; the sensor is for other road users.
+    | `pedestrians`   | `(8, 4)` | the nearest persons on foot in sight, nearest first: x, y of their centres      |
+    |                 |          | minus the ego's, / 20 m, and their x, y velocity, scaled as the ego's, all up   |
+    |                 |          | to 2; 0 in empty places                                                         |
+    | `pedestrian_mask` | `(8,)` | comes with `pedestrians`: 1 where there is one                                  |
+
+    The sensor is for other road users: `priority` goes with the vehicles' slots, and persons are seen as vehicles are,
+    with noise on their positions. The ego knows all else as it is.
 
     A vehicle keeps its slot for as long as it is on the roads and perceived; a slot stays empty for at least one step
     between two vehicles. The others' velocities and traits are not observed.

@@ -8,7 +8,7 @@ import numpy as np
 
 from tint_sumo.config import Sensor
 from tint_sumo.core.compiling import compiled
-from tint_sumo.envs.rows import Rows, show_earlier
+from tint_sumo.envs.rows import Rows, show_earlier, show_earlier_in_networks
 from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.sight import Sight, find_seen
 from tint_sumo.simulation import Simulation
@@ -102,6 +102,7 @@ class Sensing:
         if self._frames is None:
             self._frames = np.zeros((self._delay + 1, len(self.source)), rows.dtype)
         show_earlier(rows, self._frames[:, envs], steps[envs])
+        show_earlier_in_networks(rows, self._frames[:, envs], steps[envs])
 
 
 class Memory(NamedTuple):

@@ -18,7 +18,7 @@ from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
 from tint_sumo.traits.encoder import perceptron
 
 OBSERVATION_KEYS = frozenset({"ego", "vehicles", "mask", TRAITS})
-_ROAD = ("traffic_light", "speed_limit", "lane")  # keys that observations may have of the ego's road
+_ROAD = ("traffic_light", "right_of_way", "speed_limit", "lane")  # keys that observations may have of the ego's road
 _FAR_BELOW = -1e9  # score of an empty slot; finite, so that a street without vehicles gives no NaN
 
 
@@ -60,7 +60,9 @@ class AttentionExtractor(BaseFeaturesExtractor):
         ego_size, position_size, trait_size = (_last_axis(observation_space, k) for k in ("ego", "vehicles", "traits"))
         embedded = settings.embedding_sizes[-1]
         self.position_gain = settings.position_gain
-        self.embed = perceptron(position_size + trait_size + ego_size, *settings.embedding_sizes)
+        self.sees_priority = "priority" in observation_space.spaces
+        vehicle_size = position_size + trait_size + ego_size + int(self.sees_priority)
+        self.embed = perceptron(vehicle_size, *settings.embedding_sizes)
         self.score = (
             nn.Sequential(*perceptron(2 * embedded, *settings.score_sizes), nn.Linear(settings.score_sizes[-1], 1))
             if settings.attention
@@ -69,6 +71,10 @@ class AttentionExtractor(BaseFeaturesExtractor):
         self.context = perceptron(embedded, settings.context_size)
         self.road = tuple(key for key in _ROAD if key in observation_space.spaces)
         road_size = sum(_last_axis(observation_space, key) for key in self.road)
+        self.sees_pedestrians = "pedestrians" in observation_space.spaces
+        if self.sees_pedestrians:
+            self.embed_pedestrians = perceptron(_last_axis(observation_space, "pedestrians"), settings.context_size)
+            road_size += settings.context_size
         self.joint = perceptron(settings.context_size + ego_size + road_size, *settings.joint_sizes)
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
@@ -78,7 +84,9 @@ class AttentionExtractor(BaseFeaturesExtractor):
         weights = self._weights(observations["mask"], slots, rows, embedded)
         chosen = weights.flatten().index_select(0, slots).unsqueeze(-1)
         weighted = _sum_by_row(embedded * chosen.to(embedded.dtype), rows, len(ego))
-        road = (observations[key] for key in self.road)
+        road = [observations[key] for key in self.road]
+        if self.sees_pedestrians:
+            road.append(self._largest_of_pedestrians(observations))
         features: Tensor = self.joint(torch.cat([self.context(weighted), ego, *road], dim=-1))
         return features
 
@@ -97,7 +105,17 @@ class AttentionExtractor(BaseFeaturesExtractor):
         positions = observations["vehicles"].flatten(0, 1).index_select(0, slots) * self.position_gain
         traits = observations["traits"].flatten(0, 1).index_select(0, slots)
         ego = self._gained_ego(observations).index_select(0, rows)
-        return slots, rows, self.embed(torch.cat([positions, traits, ego], dim=-1))
+        parts = [positions, traits, ego]
+        if self.sees_priority:
+            parts.append(observations["priority"].flatten().index_select(0, slots).unsqueeze(-1))
+        return slots, rows, self.embed(torch.cat(parts, dim=-1))
+
+    def _largest_of_pedestrians(self, observations: dict[str, Tensor]) -> Tensor:
+        """Return the largest values (B, F) among the embeddings of a batch's pedestrians, which are 0 or more."""
+        position, velocity = observations["pedestrians"][..., :2], observations["pedestrians"][..., 2:]
+        embedded = self.embed_pedestrians(torch.cat([position * self.position_gain, velocity], dim=-1))
+        largest: Tensor = (embedded * observations["pedestrian_mask"].unsqueeze(-1)).amax(dim=-2)
+        return largest
 
     def _weights(self, mask: Tensor, slots: Tensor, rows: Tensor, embedded: Tensor) -> Tensor:
         real = _real(mask)

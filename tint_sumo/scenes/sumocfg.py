@@ -76,7 +76,7 @@ class SumocfgScene:
     controller: EgoController = field(default_factory=EgoController)
     ego_control: EgoControl = "speed"  # "sumo": SUMO's driver drives the ego, whatever the actions are
     perceives: tuple[Perceivable, ...] = ()  # further keys of the observation, in the order of ``Perceivable``
-    red_light: RedLight = "ignore"  # follows from driving over a stop line at red: nothing, a cost, the episode's end
+    red_light: RedLight = "ignore"  # consequence of driving over a stop line at red: none, a cost, the episode's end
     red_light_penalty: Penalty = 1.0  # is taken from the reward for each stop line driven over at red, with "cost"
 
     def __post_init__(self) -> None:
@@ -190,8 +190,8 @@ def from_sumocfg(
             speed and the speed limit, as a baseline on the same cases: it obeys traffic lights and the right of way,
             keeps its distance, and takes no notice of actions.
         perceives: names of further keys of the observation, which ``tint_sumo.envs.SceneEnv`` describes:
-            "traffic_light", "speed_limit" and "lane".
-        red_light: what follows if the ego's front drives over a stop line while its signal is red. "ignore": nothing.
+            "traffic_light", "right_of_way", "speed_limit", "lane" and "pedestrians".
+        red_light: consequence of the ego's front driving over a stop line while its signal is red. "ignore": none.
             "cost": the step's ``info["cost"]`` is the number of such lines, and the reward is lower by
             ``red_light_penalty`` for each. "end": the episode ends with the outcome ``red_light`` and the reward of a
             collision.

@@ -18,7 +18,7 @@ from tint_sumo.simulation.connection import SUMO_ERRORS, Connection
 EGO = "tint_sumo.ego"  # vehicle, vType and route; no user's id
 # SUMO takes a vehicle for arrived within 0.1 m; a position that it gives can be rounded.
 _ARRIVAL_M = 0.2
-_JUNCTION = ":"  # edges on junctions begin so
+JUNCTION = ":"  # edges on junctions begin so
 
 
 class Fate(Enum):
@@ -64,7 +64,7 @@ class EgoWay:
     def _is_on(self, found: Mapping[int, Any]) -> bool:
         """Return whether the ego is on its route, and goes on there."""
         edge = found[constants.VAR_ROAD_ID]
-        if edge != self._edges[self._number] and not edge.startswith(_JUNCTION):
+        if edge != self._edges[self._number] and not edge.startswith(JUNCTION):
             if edge not in self._edges[self._number :]:
                 return False
             self._number = self._edges.index(edge, self._number)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from libsumo import constants
 
-from tint_sumo.scenes.geometry import BOX, NO_VEHICLE, Bools, Boxes, measure_distances_m, sweep
+from tint_sumo.scenes.geometry import BOX, NO_VEHICLE, Bools, Boxes, Floats, measure_distances_m, sweep
 from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation.bodies import box_of
 from tint_sumo.simulation.connection import Connection
@@ -32,12 +32,14 @@ Sights = dict[str, Mapping[int, Any]]  # variables of vehicles or persons
 class Persons:
     """The persons around the ego in a running simulation.
 
-    ``boxes`` (P,) are records of ``tint_sumo.scenes.geometry.BOX`` in the scene's frame, and ``ids`` are their ids.
+    ``boxes`` (P,) are records of ``tint_sumo.scenes.geometry.BOX`` in the scene's frame, ``velocity_mps`` (P, 2) their
+    velocities, and ``ids`` are their ids.
     """
 
     def __init__(self, scene: SumocfgScene, connection: Connection) -> None:
         self._connection = connection
-        self._around_m = _AROUND_M + scene.controller.desired_speeds_mps[-1] * scene.step_s
+        reach_m = max(_AROUND_M, scene.sight_m) if "pedestrians" in scene.perceives else _AROUND_M
+        self._around_m = reach_m + scene.controller.desired_speeds_mps[-1] * scene.step_s
         self._pavements: dict[str, bool] = {}  # whether a lane is for pedestrians alone, and no crossing
         self.clear()
 
@@ -45,6 +47,7 @@ class Persons:
         """Forget the persons of an episode."""
         self.ids: tuple[str, ...] = ()
         self.boxes: Boxes = np.zeros(0, BOX)
+        self.velocity_mps: Floats = np.zeros((0, 2))
         self._subscribed = False
         self._on_road: Bools = np.zeros(0, bool)
         self._was_box: dict[str, Any] = {}  # a step ago
@@ -85,6 +88,8 @@ class Persons:
         for index, (name, sight) in enumerate(near.items()):
             size_m = (self._connection.person.getLength(name), self._connection.person.getWidth(name))
             self.boxes[index] = box_of(sight, size_m, origin_m)
+        speed_mps = np.array([sight[constants.VAR_SPEED] for sight in near.values()])
+        self.velocity_mps = np.stack([self.boxes["heading_x"], self.boxes["heading_y"]], axis=1) * speed_mps[:, None]
         self._on_road = np.array([not self._is_pavement(sight[constants.VAR_LANE_ID]) for sight in near.values()], bool)
 
     def _is_pavement(self, lane: str) -> bool:

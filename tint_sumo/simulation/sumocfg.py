@@ -286,10 +286,10 @@ class SumocfgSimulation(Simulation):
         self.egos.front_m[0] = self.scene.start_m + ego[constants.VAR_DISTANCE]
         self.egos.speed_mps[0] = ego[constants.VAR_SPEED]
         self.egos.box[0] = box_of(ego, self._ego_size_m, self.origin_m)
-        self.perception.look(float(self.egos.front_m[0]))
         self.persons.follow(self.persons.take_from(seen), self.origin_m, ego[constants.VAR_POSITION3D][2])
         seen = self._in_sight(seen, ego[constants.VAR_POSITION3D])
         self._follow(seen if seen.keys() <= self.slot.keys() else self._nearest(seen, ego[constants.VAR_POSITION3D]))
+        self.perception.look(float(self.egos.front_m[0]), self.slot)
         self._look_around()
 
     def _look_around(self) -> None:

@@ -193,18 +193,25 @@ def report(found: Check) -> str:
         lines.append(f"  {made:,} vehicles have vTypes that SUMO makes at run time")
     if found.config.left_out:
         lines.append(f"turned off        {', '.join(found.config.left_out)}")
-    lines += [f"not supported     {limit}" for limit in _limits(found)]
+    lines += [f"limits            {limit}" for limit in _limits(found)]
     lines += ["", *_ego_lines(found)]
     return "\n".join(lines)
 
 
 def _limits(found: Check) -> list[str]:
-    """Return what the configuration has that the ego does not know."""
+    """Return what the configuration has that the ego does not perceive, or need not obey."""
+    perceives, red_light = ((), "ignore") if found.scene is None else (found.scene.perceives, found.scene.red_light)
     limits = []
     if found.network.traffic_lights:
-        limits.append("traffic lights: others obey them; the ego sees none, and drives through red")
-    if found.traffic.persons:
-        limits.append("persons: the ego can hit them, and its safety check counts them; they are not observed")
+        if "traffic_light" not in perceives:
+            limits.append("traffic lights are not observed; perceives: traffic_light adds the next one")
+        if red_light == "ignore":
+            limits.append("the ego may drive through red; red_light: cost or end changes that")
+    if found.traffic.persons and "pedestrians" not in perceives:
+        limits.append(
+            "persons are not observed, but the ego can hit them, and its safety check counts them; "
+            "perceives: pedestrians adds them"
+        )
     return limits
 
 

@@ -127,6 +127,24 @@ def test_an_ego_that_stands_at_the_line_or_starts_beyond_it_drives_over_none(
         assert drive_through(simulation) == [("r", 1)] * 2
 
 
+def test_an_ego_that_waits_on_the_junction_until_its_light_is_red_has_not_driven_over_red(tmp_path: Path) -> None:
+    """A left turn has a second stop on the junction, where the ego gives way to oncoming traffic."""
+    turn = replace(lights(tmp_path, 0.5), ego_route=("left0A0", "A0A1", "A1top0"), start_m=40.0, goal_m=120.0)
+    with begun(turn.scene(perceives=("traffic_light",), red_light="cost", warm_up_s=0.0)) as simulation:
+        vehicle, counted = simulation.connection.vehicle, 0
+        set_all(simulation, "g")
+        while vehicle.getRoadID(EGO) == "left0A0":
+            simulation.step(np.array([5.0]))
+            counted += simulation.perception.lights.passed_red
+        assert vehicle.getRoadID(EGO).startswith(":")
+        set_all(simulation, "r")
+        for speed_mps in (0.0, 0.0, 0.0, *[5.0] * 20):
+            simulation.step(np.array([speed_mps]))
+            counted += simulation.perception.lights.passed_red
+        assert vehicle.getRoadID(EGO) == "A0A1"
+        assert counted == 0
+
+
 def test_the_next_light_is_as_sumo_has_it(scene_of: Callable[[float], SumocfgScene]) -> None:
     scene = replace(scene_of(0.5), warm_up_s=30.0)
     with begun(scene) as simulation:
@@ -176,14 +194,19 @@ def test_time_in_state_goes_on_over_phases_with_the_same_state(tmp_path: Path) -
     longest = {letter: max(age_s for state, age_s in found.values() if state == letter) for letter in "rygG"}
     assert longest == {"r": 17.0, "y": 3.0, "g": 20.0, "G": 5.0}
     # Later begins are in the middle of a state, whose time so far its program tells.
-    for warm_up_s in (50.0, 62.5, 70.0, 77.5):
-        later = ages(replace(scene, warm_up_s=warm_up_s), 40)
+    for warm_up_s, warm_starts in ((50.0, 0), (62.5, 1), (70.0, 0), (77.5, 1)):
+        later = ages(replace(scene, warm_up_s=warm_up_s, warm_starts=warm_starts), 40)
         assert later == {time_s: found[time_s] for time_s in later}
 
 
 def test_lights_that_are_actuated_or_off_or_change_their_program(tmp_path: Path) -> None:
     network = lights(tmp_path, 0.5, program("actuated", *PHASES))
-    states = ages(network.scene(perceives=("traffic_light",), warm_up_s=0.0), 150)
+    scene = network.scene(perceives=("traffic_light",), warm_up_s=0.0)
+    states = ages(scene, 150)
+    later = ages(
+        replace(scene, warm_up_s=50.0), 5
+    )  # the phase before, with the same state, lasted as briefly as it may
+    assert later == {time_s: states[time_s] for time_s in later}
     for (before, _), (state, age_s) in pairwise(states.values()):
         assert age_s == 0.5 if state != before else age_s > 0.5
     assert {state for state, _ in states.values()} == set("rygG")

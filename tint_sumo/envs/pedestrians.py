@@ -43,8 +43,12 @@ class PedestrianSensing:
 
     def look(self) -> None:
         """Perceive the present step."""
-        self._go_on()
         persons, ego = self._simulation.persons, self._simulation.egos.box[0]
+        for part in (self.at_m, self.velocity_mps, self.mask):
+            part[:] = 0
+        self._go_on()
+        if not persons.ids:
+            return
         seen, found = self._in_sight(), []
         for index, name in enumerate(persons.ids):
             if seen[index] and not self._lost[name]:
@@ -52,8 +56,6 @@ class PedestrianSensing:
                 at_m = np.array([box["x_m"] - ego["x_m"], box["y_m"] - ego["y_m"]]) + self._noise_m[name]
                 found.append((float(np.hypot(*at_m)), name, at_m, persons.velocity_mps[index]))
         found = sorted(found, key=lambda one: one[:2])[:PEDESTRIANS]
-        for part in (self.at_m, self.velocity_mps, self.mask):
-            part[:] = 0
         for place, (_, _, at_m, velocity_mps) in enumerate(found):
             self.at_m[place], self.velocity_mps[place], self.mask[place] = at_m, velocity_mps, True
 

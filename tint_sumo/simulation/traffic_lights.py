@@ -10,6 +10,7 @@ from tint_sumo.simulation.ego_way import EGO
 
 # SUMO's letters of signal states (https://sumo.dlr.de/docs/Simulation/Traffic_Lights.html#signal_state_definitions).
 RED = frozenset("ru")  # red, and red with yellow
+_STATIC = 0  # type of programs whose phases last as long as they say
 _SAME_LINE_M = 0.01  # stop lines that are nearer to each other are one
 
 
@@ -82,16 +83,23 @@ class RouteLights:
         return known.since_s if known.state == state else self.time_s - self._step_s
 
     def _age_s(self, name: str, index: int, state: str) -> float:
-        """Return for how long a signal has had its state: in this phase, and in those before it by their program."""
+        """Return for how long a signal has had its state: in this phase, and in those before it by their program.
+
+        Phases of programs that react to traffic have lasted at least for so long.
+        """
         lights = self._connection.trafficlight
-        age_s, program = float(lights.getSpentDuration(name)), lights.getProgram(name)
-        phases: Sequence[Any] = next(
-            (logic.phases for logic in lights.getAllProgramLogics(name) if logic.programID == program), ()
-        )
+        program = lights.getProgram(name)
+        logic = next((logic for logic in lights.getAllProgramLogics(name) if logic.programID == program), None)
+        is_static = logic is not None and logic.type == _STATIC
+        if is_static:  # SUMO forgets when a phase began where it loads a state
+            age_s = lights.getPhaseDuration(name) - (lights.getNextSwitch(name) - self.time_s)
+        else:
+            age_s = lights.getSpentDuration(name)
+        phases: Sequence[Any] = () if logic is None else logic.phases
         present = lights.getPhase(name)
         for back in range(1, len(phases)):
             earlier = phases[present - back]
             if earlier.state[index] != state:
                 break
-            age_s += earlier.duration
-        return age_s
+            age_s += earlier.duration if is_static else earlier.minDur
+        return float(age_s)

@@ -26,13 +26,13 @@ from tint_sumo import ENV_IDS
 from tint_sumo.cli import main as tint_sumo
 from tint_sumo.comparisons.traits import TraitStudy
 from tint_sumo.comparisons.traits_report import plot_noise
-from tint_sumo.config import POPULATIONS, SENSORS, Sensor
+from tint_sumo.config import POPULATIONS, SENSORS, Mix, Sensor, Traffic
 from tint_sumo.core.files import write_json
 from tint_sumo.envs import SceneEnv, TaskSettings
 from tint_sumo.methods.registry import Learned, find_method, needed_encoders
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
-from tint_sumo.scenes import T_INTERSECTION
+from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene
 from tint_sumo.scenes.drivers import DriverMember, members
 from tint_sumo.scenes.geometry import clearance_m
 from tint_sumo.simulation import SceneSimulation, Simulation
@@ -47,6 +47,8 @@ from tint_sumo.traits.storage import add_to_card
 
 TITLE_PX = 26
 CLEAR_M = 0.8
+STREET = "t_intersection_street"
+WAITING_STEPS = 400
 DATA = Path(__file__).resolve().parents[1] / "data"
 IMAGES = DATA / "images"
 TRAINING_NOISE_M = {"cross_window": 0.05}  # of the shipped trait models that are trained with noise
@@ -125,10 +127,11 @@ def make_figures(images: Path) -> None:
 
 
 def make_pictures(images: Path) -> None:
-    """Draw the paper's scene, and all scenes side by side, each with its name."""
-    pictures = {name: picture_of(name) for name in ENV_IDS}
+    """Draw the paper's scene, all scenes of its scale side by side, each with its name, and the street."""
+    pictures = {name: picture_of(name) for name in ENV_IDS if name != STREET}
     Image.fromarray(pictures[T_INTERSECTION]).save(images / "scene.png", optimize=True)
     sheet_of(pictures, 3).save(images / "scenes.png", optimize=True)
+    Image.fromarray(picture_of(STREET)).save(images / "street.png", optimize=True)
 
 
 def make_sensor_pictures(images: Path) -> None:
@@ -172,6 +175,37 @@ def make_towns_picture(images: Path) -> None:
     figure.axes[0].legend(loc="upper left")
     figure.axes[-1].set_xlabel("towns, in the order of their headways")
     figure.savefig(images / "towns.png")
+
+
+def make_willingness_picture(images: Path) -> None:
+    """Draw for each driver of the lower lane when it would yield to an ego that waits, in several populations."""
+    names = ("willing", "gentle", "inattentive", "polite")
+    figure = Figure(figsize=(9.0, 7.0), dpi=100, layout="constrained")
+    for axes, name in zip(figure.subplots(2, 2, sharex=True).flat, names, strict=True):
+        scene = replace(find_scene(T_INTERSECTION), population=POPULATIONS[name], traffic=Traffic(Mix(0.7)))
+        time_s, number, trait = traits_over_time(scene, seed=1)
+        for index, profile in enumerate(scene.population.profiles):
+            shown = trait == index
+            axes.plot(time_s[shown], number[shown], "s", color=profile.rgb, markersize=2.0)
+        axes.set_title(name)
+    figure.supxlabel("time (s)")
+    figure.supylabel("driver of the lower lane, in order of appearance")
+    figure.savefig(images / "willingness.png")
+
+
+def traits_over_time(scene: Scene, seed: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return for each step of each driver on the lower lane time, running number and present trait; an ego waits."""
+    simulation = SceneSimulation(1, scene)
+    simulation.reset(0, seed)
+    rows = []
+    for _ in range(WAITING_STEPS):
+        slots, traits = simulation.slots, simulation.traits()[0]
+        for slot in np.flatnonzero(slots.present[0] & (slots.route[0] == 0)).tolist():
+            rows.append((simulation.time_s[0], slots.vehicle_number[0, slot], traits[slot]))
+        simulation.step(np.zeros(1))
+    simulation.close()
+    time_s, number, trait = np.array(rows).T
+    return time_s, np.unique(number, return_inverse=True)[1], trait
 
 
 def sheet_of(pictures: Mapping[str, NDArray[np.uint8]], columns: int) -> Image.Image:
@@ -244,11 +278,13 @@ if __name__ == "__main__":
         make_pictures(IMAGES)
         make_sensor_pictures(IMAGES)
         make_towns_picture(IMAGES)
+        make_willingness_picture(IMAGES)
         make_films()
         sys.exit()
     make_pictures(IMAGES)
     make_sensor_pictures(IMAGES)
     make_towns_picture(IMAGES)
+    make_willingness_picture(IMAGES)
     make_traits(Path(sys.argv[1]))
     make_policies(Path(sys.argv[1]))
     make_figures(IMAGES)

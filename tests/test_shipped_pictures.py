@@ -30,7 +30,7 @@ def test_figures_are_drawn_from_the_shipped_tables(make_shipped: ModuleType, tmp
 @pytest.mark.long
 def test_pictures_of_scenes_are_those_of_their_episodes(make_shipped: ModuleType, tmp_path: Path) -> None:
     make_shipped.make_pictures(tmp_path)
-    assert_pictures_are_shipped(tmp_path, {"scene.png", "scenes.png"})
+    assert_pictures_are_shipped(tmp_path, {"scene.png", "scenes.png", "street.png"})
 
 
 def test_pictures_of_sensors_show_the_same_moment(make_shipped: ModuleType, tmp_path: Path) -> None:
@@ -41,6 +41,11 @@ def test_pictures_of_sensors_show_the_same_moment(make_shipped: ModuleType, tmp_
 def test_the_picture_of_towns_shows_the_population(make_shipped: ModuleType, tmp_path: Path) -> None:
     make_shipped.make_towns_picture(tmp_path)
     assert_pictures_are_shipped(tmp_path, {"towns.png"})
+
+
+def test_the_picture_of_willingness_shows_the_drivers(make_shipped: ModuleType, tmp_path: Path) -> None:
+    make_shipped.make_willingness_picture(tmp_path)
+    assert_pictures_are_shipped(tmp_path, {"willingness.png"})
 
 
 def assert_pictures_are_shipped(folder: Path, names: set[str]) -> None:

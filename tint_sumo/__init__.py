@@ -11,6 +11,7 @@ __version__ = "0.1.0"
 ENV_IDS = {
     "t_intersection": "tint_sumo/TIntersection-v1",
     "t_intersection_right": "tint_sumo/TIntersectionRight-v0",
+    "t_intersection_street": "tint_sumo/TIntersectionStreet-v0",
     "four_way": "tint_sumo/FourWay-v0",
     "four_way_turn": "tint_sumo/FourWayTurn-v0",
     "roundabout": "tint_sumo/Roundabout-v0",

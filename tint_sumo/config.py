@@ -310,6 +310,13 @@ class Population:
         return replace(self, idm=replace(self.idm, tau_s=tau_s), towns=towns, fitted=fitted)
 
 
+_STREET = Population(  # of a town, at 30 to 50 km/h
+    (
+        replace(CONSERVATIVE, desired_speed_mps=(30 / 3.6, 40 / 3.6), min_gap_m=(2.0, 3.0), entry_gap_m=(15.0, 25.0)),
+        replace(AGGRESSIVE, desired_speed_mps=(40 / 3.6, 50 / 3.6), min_gap_m=(1.0, 2.0), entry_gap_m=(10.0, 18.0)),
+    ),
+    idm=Idm(accel_mps2=2.0, decel_mps2=3.0, tau_s=1.2),
+)
 _TOWNS = Population(members=8, towns=Towns())
 POPULATIONS = {
     "traits": Population(),
@@ -324,6 +331,7 @@ POPULATIONS = {
     "gentle": Population(willingness=Willingness(braking_mps2=(1.0, 4.0))),
     "inattentive": Population(willingness=Willingness(attentive_s=4.0, lapse_s=2.0)),
     "polite": Population(willingness=Willingness(probability=0.2, patience_s=10.0)),
+    "street": _STREET,
 }
 
 

@@ -18,6 +18,7 @@ VERSION_1 = {  # what shipped policies and trait models were trained in
     "roundabout": "7476dff85342449f",
     "t_intersection": "3a6f90b52dfe6049",
     "t_intersection_right": "ebaaaa813247b35a",
+    "t_intersection_street": "04f69dc2278c3444",
     ALL_SCENES: "ac752bac8ce9d393",
 }
 NOT_COUNTED = {
@@ -29,6 +30,8 @@ NOT_COUNTED = {
     "time_limit_s",
     "base",
     "buildings",
+    "position_scale_m",  # the roads come with them
+    "speed_scale_mps",
 }  # fields of a scene
 
 

@@ -51,7 +51,7 @@ def test_aggressive_driver_hits_an_ego_in_its_way(lane: int, x_m: float) -> None
         assert min(speeds(simulation, GO)) == pytest.approx(3.0)
         collision = simulation.egos.collision[0]
         assert collision is not None
-        assert (simulation.population[collision.member].profile, collision.slot) == (AGGRESSIVE, 0)
+        assert (simulation.scene.population.profiles[collision.trait], collision.slot) == (AGGRESSIVE, 0)
         assert collision.route == ("lower" if lane == LOWER else "upper")
 
 

@@ -18,7 +18,8 @@ _POPULATION = optional(
     f"{{{','.join(POPULATIONS)}}}",
     "traits: conservative and aggressive drivers. continuous: desired speeds and gaps of all kinds, without classes. "
     "same_speed, same_gap: traits that do not differ in it. towns, held_out_towns: each episode in a town. "
-    "willing, gentle, inattentive, polite: states of drivers decide whether they yield.",
+    "willing, gentle, inattentive, polite: states of drivers decide whether they yield. "
+    "street: 30 to 50 km/h.",
     "the scene's, traits in built-in scenes",
 )
 

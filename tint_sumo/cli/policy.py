@@ -76,7 +76,9 @@ class TrainPolicy(NetworkCommand):
     """Size of the network, settings of PPO and number of decisions; full takes 5 to 8 minutes on a free core. In a SUMO
     configuration full has 8 environments, each a process, and 200,000 decisions."""
     sensor: Annotated[SensorValue, _SENSOR] = "perfect"
-    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}, or all of them at once: all.")] = "t_intersection"
+    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}, or all but t_intersection_street at once: all.")] = (
+        "t_intersection"
+    )
     traits: Annotated[str | None, _TRAITS] = None
     other_scene: bool = False
     """Accept a trait model that was trained in another scene."""

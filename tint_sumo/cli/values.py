@@ -44,12 +44,12 @@ def edges_of(words: Sequence[str]) -> list[str]:
 
 
 def _read_scene(value: Any, where: Where = ()) -> Any:
-    from tint_sumo.scenes import ALL_SCENES, find_scenes, read_scene
+    from tint_sumo.scenes import ALL_SCENES, SCENES, read_scene
 
     if value in (None, ALL_SCENES):
         return value
     scene = read_scene(value, where)
-    return scene.name if scene in find_scenes(ALL_SCENES) else scene
+    return scene.name if scene in [make() for make in SCENES.values()] else scene
 
 
 def _scene_in_full(value: Any) -> Any:

@@ -21,7 +21,7 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, joined, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
-from tint_sumo.scenes import SCENES, T_INTERSECTION
+from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION, find_scenes
 from tint_sumo.scenes.geometry import Floats
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.tables import markdown_table
@@ -43,7 +43,7 @@ class SceneStudy:
     settings: TraitSettings = field(default_factory=lambda: replace(TRAIT_BUDGETS["full"], epochs=10))
     seeds: Many[Seed] = (0, 1, 2)
     noise_m: NoiseM = 0.0
-    scenes: Many[str] = tuple(SCENES)
+    scenes: Many[str] = tuple(scene.name for scene in find_scenes(ALL_SCENES))
     recording_seed: TrafficSeed = 77  # seed of the first scene; no dataset of a shipped model has it
 
     def __post_init__(self) -> None:

@@ -193,10 +193,14 @@ def always_go(scene: "AnyScene") -> Policy:
 
 def time_to_collision(scene: "AnyScene") -> Policy:
     from tint_sumo.methods.network_ttc import NetworkTimeToCollision
-    from tint_sumo.methods.rules import TimeToCollision
+    from tint_sumo.methods.rules import TimeToCollision, threshold_s
     from tint_sumo.scenes import SumocfgScene
 
-    return NetworkTimeToCollision(scene) if isinstance(scene, SumocfgScene) else TimeToCollision(scene=scene)
+    return (
+        NetworkTimeToCollision(scene)
+        if isinstance(scene, SumocfgScene)
+        else TimeToCollision(threshold_s(scene), scene=scene)
+    )
 
 
 def no_traits() -> "TraitSource":

@@ -4,6 +4,7 @@ from tint_sumo.scenes import four_way as four_way
 from tint_sumo.scenes import on_ramp as on_ramp
 from tint_sumo.scenes import roundabout as roundabout
 from tint_sumo.scenes import t_intersection as t_intersection
+from tint_sumo.scenes import t_intersection_street as t_intersection_street
 from tint_sumo.scenes.registry import (
     ALL_SCENES,
     SCENES,

@@ -11,7 +11,9 @@ from tint_sumo.scenes.sumocfg import SumocfgScene
 
 T_INTERSECTION = "t_intersection"  # the paper's scene
 
-ALL_SCENES = "all"  # the scene's name for a policy that was trained in every scene at once
+ALL_SCENES = "all"  # the scene's name for a policy that was trained in all scenes of the paper's scale at once
+# Their vehicles, desired speeds and units of observations are alike. Policies carry the digest of them all.
+_ALL = ("four_way", "four_way_turn", "on_ramp", "roundabout", T_INTERSECTION, "t_intersection_right")
 
 SCENES: dict[str, Callable[[], Scene]] = {}
 
@@ -44,8 +46,8 @@ def find_scene(scene: str | AnyScene) -> AnyScene:
 
 
 def find_scenes(scene: str | AnyScene) -> tuple[AnyScene, ...]:
-    """Return all built-in scenes for ``ALL_SCENES``, and otherwise the one that ``find_scene`` finds."""
-    return tuple(make() for make in SCENES.values()) if scene == ALL_SCENES else (find_scene(scene),)
+    """Return the scenes of ``ALL_SCENES``, or the one that ``find_scene`` finds."""
+    return tuple(SCENES[name]() for name in _ALL) if scene == ALL_SCENES else (find_scene(scene),)
 
 
 def paper_scene() -> Scene:

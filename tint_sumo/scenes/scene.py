@@ -17,6 +17,7 @@ from tint_sumo.config import (
     Claim,
     CoordinateM,
     EgoController,
+    Gain,
     Mix,
     Population,
     Slots,
@@ -89,6 +90,8 @@ class Scene:
     step_s: StepS = 0.1  # code; SUMO counts whole milliseconds
     time_limit_s: TimeS = 50.0  # code
     base: str = ""  # name of the built-in scene that it is with other numbers
+    position_scale_m: Gain = POSITION_SCALE_M  # positions are observed divided by this
+    speed_scale_mps: Gain = SPEED_SCALE_MPS  # velocities are observed divided by this
     buildings: tuple[Building, ...] = ()  # they hide vehicles from a sensor with occlusion, and change nothing else
 
     sumocfg: ClassVar[Path | None] = None  # the SUMO configuration whose traffic it has: none
@@ -140,19 +143,9 @@ class Scene:
         return self.network.speed_limit_mps
 
     @property
-    def speed_scale_mps(self) -> float:
-        """Velocities are observed divided by this."""
-        return SPEED_SCALE_MPS
-
-    @property
-    def position_scale_m(self) -> float:
-        """Positions of the others are observed divided by this."""
-        return POSITION_SCALE_M
-
-    @property
     def ego_scale_m(self) -> float:
         """The ego's position is observed divided by this."""
-        return POSITION_SCALE_M
+        return self.position_scale_m
 
     def with_drivers(self, p_conservative: Mix | None, tau_s: float | None) -> "Scene":
         """Return the scene with another mix and another time headway of its drivers, where they are given."""

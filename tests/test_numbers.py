@@ -12,6 +12,9 @@ from tint_sumo import traits
 from tint_sumo.cli import main
 from tint_sumo.config import NO_LEADER_GAP_M, PPO_BUDGETS, SENSORS, STEP_S
 from tint_sumo.core.percentages import percent
+from tint_sumo.drivers.check import FITTED, OTHERS, QUANTITIES
+from tint_sumo.drivers.models import MODELS
+from tint_sumo.drivers.prediction import ERRORS
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import find_learned, learned_methods
 from tint_sumo.study.results_csv import read_csv
@@ -200,6 +203,29 @@ def test_the_tables_of_sensors_are_those_of_the_results() -> None:
         start, lane = (row.iloc[number] for number in range(2))
         gained = f"{lane['success_percent'] - start['success_percent']:.1f}"
         assert line.split(" | ", 1)[1] == f"{_outcomes(start)} | {_outcomes(lane)} | {gained} |"
+
+
+def test_the_page_on_calibration_has_the_measured_numbers() -> None:
+    measured = pandas.read_csv(RESULTS / "calibration.csv").set_index(["group", "name"])
+
+    def shown(group: str, name: str, decimals: int = 2) -> str:
+        if (group, name) not in measured.index:
+            return "-"
+        value, low, high = measured.loc[(group, name), ["value", "low", "high"]]
+        return f"{value:.{decimals}f} [{low:.{decimals}f}, {high:.{decimals}f}]"
+
+    page = DOCS / "explanation" / "calibration.md"
+    fits, predictions, distances = (table.strip().split("\n")[2:] for table in _tables(page))
+    for line, model in zip(fits, MODELS, strict=True):
+        own, default = (shown(f"gap error {model}", name) for name in ("fitted to the pair itself", "SUMO's defaults"))
+        assert line == f"| {model} | {own} m | {default} m |"
+    for line, name in zip(predictions, ERRORS, strict=True):
+        cells = f"{shown('prediction', name, 1)} | {shown('posterior less', name, 1)}"
+        assert line.split(" | ", 1)[1] == f"{cells} |"
+    for line, (quantity, unit) in zip(distances, QUANTITIES.items(), strict=True):
+        cells = [shown("distance", f"{quantity}, {drivers}") for drivers in (*FITTED, *OTHERS)]
+        assert line == f"| {quantity}, {unit} | {' | '.join(cells)} |"
+    assert f"takes {measured.loc[('time', 'fit of all pairs'), 'value']:.0f} s on one core" in _prose(str(page))
 
 
 def _outcomes(row: pandas.Series) -> str:

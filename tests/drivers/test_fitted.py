@@ -13,7 +13,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
 from tint_sumo.core.progress import Progress
 from tint_sumo.drivers import fitted as module
-from tint_sumo.drivers.fitted import FITTED_FILE, TABLE_FILE, fit_drivers, read_fitted, report_text
+from tint_sumo.drivers.fitted import FITTED_FILE, fit_drivers, read_fitted, report_text
 from tint_sumo.drivers.fitting import Estimate, fit_pair
 from tint_sumo.drivers.models import MODELS, CarFollowing
 from tint_sumo.drivers.pairs import Pair
@@ -22,8 +22,9 @@ from tint_sumo.drivers.pairs import Pair
 def test_the_file_is_read_back(known: KnownFit) -> None:
     assert read_fitted(known.out) == read_fitted(known.out / FITTED_FILE) == known.fitted
     assert sorted(file.name for file in known.out.iterdir() if file.name[0] != ".") == [
-        TABLE_FILE,
+        "drivers.csv",
         FITTED_FILE,
+        "pairs.csv",
         "run.json",
     ]
 
@@ -101,14 +102,17 @@ def test_damaged_files_are_refused(known: KnownFit, tmp_path: Path, change: Any,
         read_fitted(tmp_path)
 
 
-def test_the_table_has_every_parameter_with_its_interval(known: KnownFit) -> None:
-    table = pd.read_csv(known.out / TABLE_FILE)
-    assert table["driver"].tolist() == [driver.name for driver in known.fitted.drivers]
-    for parameter in known.fitted.car_following.parameters:
-        low, value, high = (table[f"{parameter.name}{end}"] for end in ("_low", "", "_high"))
-        assert ((low < value) & (value < high)).all()
-    truth = np.exp([known.log_parameters[name][1] for name in table["driver"]])
-    np.testing.assert_allclose(table["tau_s"], truth, rtol=0.15)
+def test_the_tables_have_every_parameter_with_its_interval(known: KnownFit) -> None:
+    drivers, pairs = (pd.read_csv(known.out / name) for name in ("drivers.csv", "pairs.csv"))
+    assert drivers["driver"].tolist() == [driver.name for driver in known.fitted.drivers]
+    assert pairs["pair"].tolist() == [pair.name for pair in known.pairs]
+    for table in (drivers, pairs):
+        for parameter in known.fitted.car_following.parameters:
+            low, value, high = (table[f"{parameter.name}{end}"] for end in ("_low", "", "_high"))
+            assert ((low <= value) & (value <= high)).all()
+        truth = np.exp([known.log_parameters[name][1] for name in table["driver"]])
+        np.testing.assert_allclose(table["tau_s"], truth, rtol=0.15)
+    assert (pairs["gap_rmse_m"] < pairs["sumo_gap_rmse_m"]).all()
 
 
 def test_the_report_names_all_parameters(known: KnownFit) -> None:

@@ -47,7 +47,7 @@ class FitDrivers(Command):
 
     def run(self) -> Outcome:
         from tint_sumo.core.structures import plain
-        from tint_sumo.drivers.fitted import FITTED_FILE, TABLE_FILE, fit_drivers, report_text
+        from tint_sumo.drivers.fitted import FITTED_FILE, TABLES, fit_drivers, report_text
         from tint_sumo.drivers.models import MODELS
         from tint_sumo.drivers.pairs import left_out_text, read_pairs
         from tint_sumo.jobs.table import one_job
@@ -55,7 +55,7 @@ class FitDrivers(Command):
         found = read_pairs(self.recording, self.format, self.step, self.min_duration)
         with one_job("fit") as report:
             fitted = fit_drivers(found.pairs, MODELS[self.model], self.out, report)
-        files = [str(self.out / name) for name in (FITTED_FILE, TABLE_FILE)]
+        files = [str(self.out / name) for name in (FITTED_FILE, *TABLES)]
         return Outcome("\n".join([*left_out_text(found), report_text(fitted), *wrote(files)]), plain(fitted))
 
 

@@ -27,7 +27,8 @@ from tint_sumo.drivers.population import (
     posterior,
 )
 
-FITTED_FILE, TABLE_FILE = "fitted.json", "drivers.csv"
+FITTED_FILE = "fitted.json"
+TABLES = ("drivers.csv", "pairs.csv")
 _PAIRS_FILE, _POPULATION_FILE = "pairs.json", "population.json"  # of an unfinished run
 _KEEP_EVERY_S = 5.0
 _ROLE = "fitted drivers"
@@ -121,18 +122,40 @@ class Fitted:
     def car_following(self) -> CarFollowing:
         return MODELS[self.model]
 
-    def table(self) -> pd.DataFrame:
-        """Return a row for each driver: its parameters, each with the ends of its 95 % interval."""
-        model, rows = self.car_following, []
-        for driver in self.drivers:
-            estimate = driver.fit.estimate
-            low, high = np.exp(estimate.interval(model))
-            row: dict[str, object] = {"driver": driver.name, "pairs": driver.pairs, "duration_s": driver.duration_s}
-            for index, name in enumerate(self.parameters):
-                row[name] = float(np.exp(estimate.log_parameters[index]))
-                row[f"{name}_low"], row[f"{name}_high"] = float(low[index]), float(high[index])
-            rows.append(row)
+    def drivers_table(self) -> pd.DataFrame:
+        """Return a row for each driver, over all situations: its parameters with the ends of their 95 % intervals."""
+        rows = [
+            {"driver": one.name, "pairs": one.pairs, "duration_s": one.duration_s, **self._columns(one.fit)}
+            for one in self.drivers
+        ]
         return pd.DataFrame(rows)
+
+    def pairs_table(self) -> pd.DataFrame:
+        """Return a row for each pair, fitted alone: errors of the gap, and parameters with their 95 % intervals."""
+        rows = [
+            {
+                "pair": one.name,
+                "driver": one.driver,
+                "duration_s": one.duration_s,
+                "gap_rmse_m": one.gap_rmse_m,
+                "sumo_gap_rmse_m": one.sumo_gap_rmse_m,
+                **self._columns(one.fit),
+            }
+            for one in self.pairs
+        ]
+        return pd.DataFrame(rows)
+
+    def _columns(self, fit: Fit) -> dict[str, float]:
+        """Return parameters with the ends of their intervals, by the names of their columns."""
+        ends = fit.estimate.interval(self.car_following)
+        columns: dict[str, float] = {}
+        for name, value, low, high in zip(self.parameters, np.array(fit.log_parameters), *ends, strict=True):
+            columns |= {
+                name: float(np.exp(value)),
+                f"{name}_low": float(np.exp(low)),
+                f"{name}_high": float(np.exp(high)),
+            }
+        return columns
 
 
 def _numbers(values: Floats) -> Numbers:
@@ -176,8 +199,9 @@ def fit_drivers(pairs: Sequence[Pair], model: CarFollowing, out: Path, report: R
             fits = _fit_pairs(pairs, model, out / _PAIRS_FILE, report)
             population = _fit_population(pairs, model, fits, out / _POPULATION_FILE, report)
             fitted = _collect(pairs, model, fits, population)
-            with whole_file(out / TABLE_FILE) as partial:
-                fitted.table().to_csv(partial, index=False, float_format="%.6g")
+            for name, table in zip(TABLES, (fitted.drivers_table(), fitted.pairs_table()), strict=True):
+                with whole_file(out / name) as partial:
+                    table.to_csv(partial, index=False, float_format="%.6g")
             write_json(out / FITTED_FILE, plain(fitted))
         for name in (_PAIRS_FILE, _POPULATION_FILE):
             (out / name).unlink(missing_ok=True)

@@ -2,8 +2,8 @@
 
 Objective (Kesting and Treiber 2008, Transportation Research Record 2088, 148-156): the follower is driven behind its
 recorded leader from its first position and speed on, without any correction, and the sum of squared errors of the gap
-is least. Errors of such a trajectory grow and fade slowly, so intervals take them for autocorrelated (AR(1), as Zhang
-and Sun 2022 do, https://arxiv.org/abs/2210.03571); with independent errors they would be far too narrow.
+is least. Errors of such a trajectory grow and fade slowly (Zhang and Sun 2022, https://arxiv.org/abs/2210.03571), so
+intervals take them for an AR(1) process; with independent errors they would be far too narrow.
 """
 
 import math

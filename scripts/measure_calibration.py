@@ -1,0 +1,132 @@
+"""Measure how well drivers are fitted: to their recordings, to other pairs of them, and in SUMO's traffic.
+
+Reads the recordings that stand beside the project, and writes ``calibration.csv`` into data/results:
+python scripts/measure_calibration.py [FOLDER]
+"""
+
+import csv
+import io
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tint_sumo.core.files import write_text
+from tint_sumo.drivers.check import check
+from tint_sumo.drivers.fitted import fit_drivers
+from tint_sumo.drivers.fitting import Estimate, fit_pair, gap_rmse_m
+from tint_sumo.drivers.models import MODELS
+from tint_sumo.drivers.pairs import Pair, read_pairs
+from tint_sumo.drivers.prediction import ERRORS, predict_each
+
+Floats = NDArray[np.float64]
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "data" / "results"
+RECORDINGS = ROOT.parent / "shared" / "real" / "car_following"
+LONG_S = 15.0
+RESAMPLES = 10_000
+
+
+@dataclass(frozen=True)
+class Row:
+    """A number with its 95 % interval, from a bootstrap over drivers; NaN where there is none."""
+
+    group: str
+    name: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    count: int  # of pairs
+
+
+def bootstrap(drivers: Sequence[str], values: Floats, mean: bool = False) -> tuple[float, float, float]:
+    """Return the median or mean of the pairs' values, and the ends of its interval."""
+    statistic = np.mean if mean else np.median
+    own = [np.flatnonzero([driver == name for driver in drivers]) for name in dict.fromkeys(drivers)]
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(RESAMPLES):
+        sample = np.concatenate([own[index] for index in rng.integers(0, len(own), len(own))])
+        found.append(statistic(values[sample]))
+    low, high = np.percentile(found, [2.5, 97.5])
+    return float(statistic(values)), float(low), float(high)
+
+
+def fits_of_pairs(pairs: Sequence[Pair], model: str) -> tuple[dict[str, Estimate], Iterator[Row]]:
+    """Fit each pair alone."""
+    fits = {pair.name: fit_pair(MODELS[model], pair) for pair in pairs}
+    drivers = [pair.driver for pair in pairs]
+
+    def rows() -> Iterator[Row]:
+        for name, parameters in (
+            ("fitted to the pair itself", {pair.name: fits[pair.name].log_parameters for pair in pairs}),
+            ("SUMO's defaults", {pair.name: MODELS[model].defaults for pair in pairs}),
+        ):
+            errors_m = np.array([gap_rmse_m(MODELS[model], pair, parameters[pair.name]) for pair in pairs])
+            yield Row(f"gap error {model}", name, "m", *bootstrap(drivers, errors_m), len(pairs))
+
+    return fits, rows()
+
+
+def predictions(pairs: Sequence[Pair], fits: Mapping[str, Estimate]) -> Iterator[Row]:
+    """Predict each pair of a driver with several from its others."""
+    found = predict_each(MODELS["IDM"], pairs, fits)
+    drivers = [pair.driver for pair in pairs if pair.name in found]
+    errors_m = {
+        name: np.array([getattr(found[pair.name], name) for pair in pairs if pair.name in found]) for name in ERRORS
+    }
+    for name in ERRORS:
+        yield Row("prediction", name, "m", *bootstrap(drivers, errors_m[name]), len(drivers))
+    for name in ERRORS:
+        if name not in ("fitted", "posterior"):
+            difference_m = errors_m["posterior"] - errors_m[name]
+            yield Row("posterior less", name, "m", *bootstrap(drivers, difference_m), len(drivers))
+            yield Row("posterior less, mean", name, "m", *bootstrap(drivers, difference_m, mean=True), len(drivers))
+
+
+def traffic(pairs: Sequence[Pair]) -> Iterator[Row]:
+    """Fit all pairs, and compare the traffic of the fitted drivers with the recorded one."""
+    with tempfile.TemporaryDirectory() as folder:
+        began_s = time.process_time()
+        fitted = fit_drivers(pairs, MODELS["IDM"], Path(folder) / "fit")
+        yield Row("time", "fit of all pairs", "s", time.process_time() - began_s, np.nan, np.nan, len(pairs))
+    found = check(fitted, pairs, repeats=5, seed=0)
+    for one in found.distances:
+        numbers = (one.distance.value, one.distance.low, one.distance.high)
+        yield Row("distance", f"{one.quantity}, {one.drivers}", "", *numbers, len(pairs))
+        for other, ratio in one.ratios.items():
+            numbers = (ratio.value, ratio.low, ratio.high)
+            yield Row("ratio", f"{one.quantity}, {one.drivers}, {other}", "1", *numbers, len(pairs))
+
+
+def measure(folder: Path) -> Iterator[Row]:
+    """Yield all numbers."""
+    pairs = read_pairs(folder).pairs
+    long = [pair for pair in pairs if pair.duration_s > LONG_S - 1e-6]
+    for model in MODELS:
+        fits, rows = fits_of_pairs(long, model)
+        yield from rows
+        if model == "IDM":
+            yield from predictions(long, fits)
+    yield from traffic(pairs)
+
+
+def main(folder: Path) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([field.name for field in fields(Row)])
+    for row in measure(folder):
+        writer.writerow([f"{value:.4g}" if isinstance(value, float) else value for value in astuple(row)])
+        print(row)
+    write_text(RESULTS / "calibration.csv", text.getvalue())
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else RECORDINGS)

@@ -1,13 +1,16 @@
 """Environments of SUMO configurations, and snapshots of episodes."""
 
+import hashlib
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+import psutil
 import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
@@ -69,6 +72,40 @@ def test_gymnasium_makes_and_checks_them(name: str, user_network: Make) -> None:
         assert not info["passed"].any()
     finally:
         env.close()
+
+
+@pytest.mark.parametrize("name", ["autobahn", "braunschweig"])
+def test_configurations_that_sumo_ships_run_for_20_episodes_and_stay_as_they_are(name: str, user_network: Make) -> None:
+    network = user_network(name)
+    before = contents_of(network.sumocfg.parent)
+    with made(network.scene(warm_up_s=5.0), max_episode_steps=10) as env:
+        for seed in range(20):
+            env.reset(seed=seed)
+            while not any(env.step(2)[2:4]):
+                pass
+    assert contents_of(network.sumocfg.parent) == before
+
+
+def contents_of(folder: Path) -> dict[Path, tuple[str, int]]:
+    """Return the digests and times of change of all files in a folder."""
+    return {
+        file: (hashlib.sha256(file.read_bytes()).hexdigest(), file.stat().st_mtime_ns)
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
+
+
+@pytest.mark.long
+def test_resets_need_no_more_memory(user_network: Make) -> None:
+    scene = user_network("merge").scene(warm_up_s=10.0, warm_starts=2)
+    rss_bytes = []
+    with made(scene) as env:
+        for seed in range(500):
+            env.reset(seed=seed)
+            env.step(2)
+            if seed in (99, 499):
+                rss_bytes.append(psutil.Process().memory_info().rss)
+    assert rss_bytes[1] - rss_bytes[0] < 2 * 2**20
 
 
 def test_the_traits_are_the_numbers_of_the_vtypes(user_network: Make) -> None:

@@ -44,9 +44,10 @@ def episode(scene: SumocfgScene, sensor: Sensor, **settings: Any) -> Iterator[tu
             ended = terminated or truncated
 
 
-def distances_m(observation: dict[str, Any]) -> np.ndarray:
+def distances_m(observation: dict[str, Any], scene: SumocfgScene) -> np.ndarray:
     """Return the distances of the persons in an observation."""
-    return np.hypot(*observation["pedestrians"][observation["pedestrian_mask"] > 0.5, :2].T) * 20.0
+    at = observation["pedestrians"][observation["pedestrian_mask"] > 0.5, :2]
+    return np.hypot(*at.T) * scene.position_scale_m
 
 
 def test_the_nearest_are_where_sumo_has_them_and_move_so(scene: SumocfgScene) -> None:
@@ -60,7 +61,8 @@ def test_the_nearest_are_where_sumo_has_them_and_move_so(scene: SumocfgScene) ->
             angle, speed_mps = math.radians(person.getAngle(name)), person.getSpeed(name)
             ahead = np.array([math.sin(angle), math.cos(angle)])
             at_m = np.array([x_m - left_m - ego["x_m"], y_m - low_m - ego["y_m"]]) - ahead * person.getLength(name) / 2
-            there[name] = np.hypot(*at_m), np.concatenate([at_m / 20.0, ahead * speed_mps / SPEED_MPS])
+            moves, at = ahead * speed_mps / SPEED_MPS, at_m / scene.position_scale_m
+            there[name] = np.hypot(*at_m), np.concatenate([at, moves])
         near = sorted((one for one in there.values() if one[0] <= scene.sight_m), key=lambda one: float(one[0]))
         shown = observation["pedestrians"][observation["pedestrian_mask"] > 0.5]
         assert len(shown) == min(len(near), PEDESTRIANS)
@@ -73,7 +75,7 @@ def test_the_nearest_are_where_sumo_has_them_and_move_so(scene: SumocfgScene) ->
 
 def test_range_field_of_view_occlusion_and_dropouts_hide_them(scene: SumocfgScene) -> None:
     perfect = [int(one["pedestrian_mask"].sum()) for one, _ in episode(scene, Sensor())]
-    near = [distances_m(one) for one, _ in episode(scene, Sensor(range_m=15.0))]
+    near = [distances_m(one, scene) for one, _ in episode(scene, Sensor(range_m=15.0))]
     assert max(map(len, near)) > 0
     assert all((one <= 15.0 + 1e-5).all() for one in near)
     ahead = [one for one, _ in episode(scene, Sensor(field_of_view_deg=40.0))]
@@ -93,7 +95,7 @@ def test_buildings_hide_them(scene: SumocfgScene) -> None:
         simulation.walls = np.array([[8.0, -40.0, 8.0, 40.0]])  # right across the ego's way
         assert before > 0
         seen = env.step(0)[0]
-        assert (seen["pedestrians"][seen["pedestrian_mask"] > 0.5, 0] <= 0.4).all()
+        assert (seen["pedestrians"][seen["pedestrian_mask"] > 0.5, 0] * scene.position_scale_m <= 8.01).all()
         assert seen["pedestrian_mask"].sum() < before
 
 
@@ -114,7 +116,7 @@ def test_noise_is_on_positions_and_follows_from_the_seed_alone(scene: SumocfgSce
         for place in range(int(both)):
             off = noisy["pedestrians"] - true["pedestrians"][place]
             nearest = off[np.hypot(*off[:, :2].T).argmin()]
-            errors.append(nearest[:2] * 20.0)
+            errors.append(nearest[:2] * scene.position_scale_m)
     assert 0.05 < np.std(errors) < 0.15
 
 

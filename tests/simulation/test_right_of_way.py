@@ -15,7 +15,8 @@ from tint_sumo.simulation import SumocfgSimulation
 from tint_sumo.simulation.ego_way import EGO
 
 _AT = {"w": (-100, 0), "e": (100, 0), "s": (0, -100), "n": (0, 100)}
-_WAYS = {"from_west": "wc ce", "from_east": "ec cw", "turns_right": "nc cw", "from_north": "nc cs"}
+_WAYS = {"from_west": "wc ce", "from_east": "ec cw", "turns_right": "nc cw", "from_north": "nc cs", "leaves": "wc cs"}
+_FROM_M = {"leaves": 25}  # behind another one
 
 Make = Callable[..., SumocfgScene]
 
@@ -34,9 +35,10 @@ def crossing(tmp_path_factory: pytest.TempPathFactory) -> Make:
         )
         net = netconvert(folder, f'<node id="c" x="0" y="0" type="{kind}"/>{nodes}', edges)
         vehicles = "".join(
-            f'<vehicle id="{name}" depart="0" departPos="40" departSpeed="5"><route edges="{edges}"/></vehicle>'
-            for name, edges in _WAYS.items()
-            if not edges.startswith(ego_route[0])
+            f'<vehicle id="{name}" depart="0" departPos="{_FROM_M.get(name, 40)}" departSpeed="5">'
+            f'<route edges="{way}"/></vehicle>'
+            for name, way in _WAYS.items()
+            if not way.startswith(ego_route[0])
         )
         (folder / "x.rou.xml").write_text(f"<routes>{vehicles}</routes>")
         sumocfg = write_config(folder / "x.sumocfg", net.name, "x.rou.xml", f'<step-length value="{step_s}"/>')

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.scenes.networks import UserNetwork, lights
-from tint_sumo.config import Backend
-from tint_sumo.scenes import SumocfgScene
+from tests.scenes.networks import UserNetwork, lights, netconvert, write_config
+from tint_sumo.config import Backend, EgoController
+from tint_sumo.scenes import SumocfgScene, from_sumocfg
 from tint_sumo.simulation import SumocfgSimulation
 from tint_sumo.simulation.ego_way import EGO
 
@@ -145,6 +145,31 @@ def test_an_ego_that_waits_on_the_junction_until_its_light_is_red_has_not_driven
         assert counted == 0
 
 
+def test_a_red_light_counts_in_the_step_in_which_the_ego_arrives_and_in_no_step_after(tmp_path: Path) -> None:
+    """The edge behind the light is so short that the ego drives over both ends of the junction in a step."""
+    at = {"w": (-500, 0), "e": (25, 0), "s": (0, -90), "n": (0, 90)}
+    nodes = '<node id="c" x="0" y="0" type="traffic_light"/>' + "".join(
+        f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in at.items()
+    )
+    edges = "".join(f'<edge id="{a}{b}" from="{a}" to="{b}" speed="50"/>' for a, b in ("wc", "ce", "sc", "cn"))
+    net = netconvert(tmp_path, nodes, edges)
+    (tmp_path / "x.rou.xml").write_text('<routes><vType id="car"/></routes>')
+    sumocfg = write_config(tmp_path / "x.sumocfg", net.name, "x.rou.xml")
+    controller = EgoController((0.0, 50.0), accel_limit_mps2=50.0)
+    scene = from_sumocfg(sumocfg, ["wc", "ce"], 5.0, 500.0, warm_up_s=0.0, controller=controller, red_light="cost")
+    at_once = 0
+    for start_m in range(5, 55, 10):
+        with begun(replace(scene, start_m=float(start_m))) as simulation:
+            set_all(simulation, "r")
+            counts = []
+            for _ in range(16):
+                simulation.step(np.array([50.0]))
+                counts.append(simulation.perception.lights.passed_red)
+                at_once += counts[-1] == 1 and not np.isfinite(simulation.egos.front_m[0])
+            assert sum(counts) == 1
+    assert at_once > 0
+
+
 def test_the_next_light_is_as_sumo_has_it(scene_of: Callable[[float], SumocfgScene]) -> None:
     scene = replace(scene_of(0.5), warm_up_s=30.0)
     with begun(scene) as simulation:
@@ -203,9 +228,7 @@ def test_lights_that_are_actuated_or_off_or_change_their_program(tmp_path: Path)
     network = lights(tmp_path, 0.5, program("actuated", *PHASES))
     scene = network.scene(perceives=("traffic_light",), warm_up_s=0.0)
     states = ages(scene, 150)
-    later = ages(
-        replace(scene, warm_up_s=50.0), 5
-    )  # the phase before, with the same state, lasted as briefly as it may
+    later = ages(replace(scene, warm_up_s=50.0), 5)  # the red phase before was as short as it may be
     assert later == {time_s: states[time_s] for time_s in later}
     for (before, _), (state, age_s) in pairwise(states.values()):
         assert age_s == 0.5 if state != before else age_s > 0.5

@@ -82,9 +82,9 @@ def _read_lane(road: Road) -> dict[str, Floats]:
 
 
 def _read_pedestrians(road: Road) -> dict[str, Floats]:
-    seen, speed_mps = road.pedestrians, road.simulation.scene.speed_scale_mps
+    seen, scene = road.pedestrians, road.simulation.scene
     seen.look()
-    values = np.hstack([seen.at_m / POSITION_SCALE_M, seen.velocity_mps / speed_mps])
+    values = np.hstack([seen.at_m / scene.position_scale_m, seen.velocity_mps / scene.speed_scale_mps])
     return {"pedestrians": np.clip(values, -BOUND, BOUND), "pedestrian_mask": seen.mask.astype(np.float64)}
 
 

@@ -64,8 +64,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     |                 |        | right-hand traffic), and how many lanes the edge has; on junctions of their lanes |
 
     | `pedestrians`   | `(8, 4)` | the nearest persons on foot in sight, nearest first: x, y of their centres      |
-    |                 |          | minus the ego's, / 20 m, and their x, y velocity, scaled as the ego's, all up   |
-    |                 |          | to 2; 0 in empty places                                                         |
+    |                 |          | minus the ego's, scaled as in `vehicles`, and their x, y velocity, scaled as    |
+    |                 |          | the ego's, all up to 2; 0 in empty places                                       |
     | `pedestrian_mask` | `(8,)` | comes with `pedestrians`: 1 where there is one                                  |
 
     The sensor is for other road users: `priority` goes with the vehicles' slots, and persons are seen as vehicles are,

@@ -75,7 +75,7 @@ def braunschweig(_: Path) -> Network:
         perceives=("traffic_light",),
         red_light="end",
     )
-    return Network(scene, _slow_decisions(scene), 60_000)
+    return Network(scene, _slow_decisions(scene), 32_000)
 
 
 def grid(folder: Path) -> Network:
@@ -102,14 +102,14 @@ def grid(folder: Path) -> Network:
         perceives=("traffic_light",),
         red_light="end",
     )
-    return Network(scene, _slow_decisions(scene), 60_000)
+    return Network(scene, _slow_decisions(scene), 32_000)
 
 
 def _slow_decisions(scene: SumocfgScene) -> PpoSettings:
     """Return settings with decisions every 0.8 s: the ego waits for lights for long."""
     usual = network_ppo(scene.step_s)
     repeat = 2 * usual.action_repeat
-    return replace(usual, n_envs=1, n_steps=512, n_minibatches=1, n_epochs=8, learning_rate=2e-3, action_repeat=repeat)
+    return replace(usual, n_envs=1, n_steps=256, n_minibatches=1, n_epochs=8, learning_rate=2e-3, action_repeat=repeat)
 
 
 NETWORKS = {make.__name__: make for make in (motorway, braunschweig, grid)}

@@ -21,6 +21,7 @@ import torch
 
 from tests.bombs import BOMBS, bomb
 from tests.methods import runs
+from tests.scenes.networks import UserNetwork
 from tests.simulation.scenes import T
 from tint_sumo import traits
 from tint_sumo.config import SENSORS, Mix, PolicySettings, PpoSettings, TraitSettings
@@ -240,6 +241,20 @@ def test_an_interrupted_run_ends_with_the_very_same_policy(method: str, tmp_path
             train(resumed, report=interrupt_at(steps), film=look)
         torch.manual_seed(steps)  # another process has other random numbers
     train(resumed, report=draw, film=look)
+    assert_same_training(resumed, at_a_stretch)
+
+
+def test_an_interrupted_run_in_a_sumo_configuration_ends_with_the_very_same_policy(
+    tmp_path: Path, tiny: PpoSettings, user_network: Callable[[str], UserNetwork]
+) -> None:
+    scene = user_network("merge").scene(warm_up_s=2.0, warm_up_spread_s=9.0, warm_starts=3, perceives=("lane",))
+    settings = replace(tiny, n_envs=1, n_minibatches=1, time_limit_s=4.0)  # an episode has 10 decisions
+    train = partial(train_policy, "no_labels", None, 64, 0, settings=settings, scene=scene)
+    at_a_stretch, resumed = tmp_path / "at_a_stretch", tmp_path / "resumed"
+    train(at_a_stretch)
+    with pytest.raises(KeyboardInterrupt):
+        train(resumed, report=interrupt_at(32))
+    train(resumed)
     assert_same_training(resumed, at_a_stretch)
 
 

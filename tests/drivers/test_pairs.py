@@ -1,15 +1,17 @@
 """Leaders and followers are found in tracks of any format."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.drivers.recordings import HEADER, population, simulated_pair, write_pair, write_pairs
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
-from tint_sumo.drivers.pairs import Recorded, find_pairs, read_pairs
+from tint_sumo.drivers.pairs import Recorded, find_pairs, left_out_text, read_pairs
 from tint_sumo.tracks.schema import build_tracks
 
 RADIUS_M, LANE_M = 100.0, 3.5
@@ -88,6 +90,25 @@ def test_missing_frames_and_new_leaders_begin_a_new_pair(tmp_path: Path) -> None
     assert read_pairs(file, min_duration_s=5.0).short == 1
 
 
+@pytest.mark.parametrize(("column", "jump_m"), [("xLeaderReal", 8.0), ("xFollowerReal", -8.0)])
+def test_pairs_are_cut_where_a_vehicle_jumps(tmp_path: Path, column: str, jump_m: float) -> None:
+    file = write_pair(tmp_path / "pair.csv", simulated_pair(population(1, 0)[0], rows=100))
+    rows = pd.read_csv(file)
+    rows.loc[60:, column] += jump_m
+    rows.to_csv(file, index=False)
+    found = read_pairs(file)
+    assert [pair.rows for pair in found.pairs] == [60, 40]
+    assert left_out_text(found) == ["left out: 1 moments at which a vehicle jumps, where pairs were cut"]
+
+
+def test_vehicles_in_each_other_are_no_pair(tmp_path: Path) -> None:
+    pair = simulated_pair(population(1, 0)[0], rows=100)
+    nearer = replace(pair, leader_rear_m=pair.leader_rear_m - pair.gap_m.min() - 0.5)
+    (before, *_) = read_pairs(write_pair(tmp_path / "pair.csv", nearer)).pairs
+    assert before.rows < 100
+    assert all((part.gap_m > 0.0).all() for part in read_pairs(tmp_path / "pair.csv").pairs)
+
+
 def test_a_folder_is_read_file_by_file(tmp_path: Path) -> None:
     first, second = population(2, 0)
     pairs = [simulated_pair(first, 0), simulated_pair(first, 1), simulated_pair(second, 2, follower="2")]
@@ -108,8 +129,9 @@ def test_a_folder_is_read_file_by_file(tmp_path: Path) -> None:
         (lambda text: text + text.splitlines()[5] + "\n", "more than once"),
         (lambda text: "\n".join(text.splitlines()[:8]), "1 are shorter than 1 s"),
         (lambda text: text.replace(",leader0,", ",1,"), "more than once"),
+        (lambda text: text.replace("Leader", "X").replace("Follower", "Leader").replace("X", "Follower"), "not ahead"),
     ],
-    ids=("empty", "no rows", "missing column", "duplicate frame", "short", "one vehicle"),
+    ids=("empty", "no rows", "missing column", "duplicate frame", "short", "one vehicle", "turned round"),
 )
 def test_bad_files_are_refused(tmp_path: Path, change: Any, message: str) -> None:
     file = write_pair(tmp_path / "pair.csv", simulated_pair(population(1, 0)[0], rows=50))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tint_sumo.config import STEP_S
 from tint_sumo.core.compiling import compiled
 from tint_sumo.core.errors import InputError
+from tint_sumo.tracks.inspection import jumping_rows
 from tint_sumo.tracks.reading import formats_of, read_tracks
 from tint_sumo.tracks.schema import Tracks
 
@@ -31,6 +32,7 @@ _SAME_DIRECTION_RAD = math.radians(60.0)
 _LONG_STEP = 1.5  # times the usual step of a recording: frames are missing
 _MOVED_M = 20.0  # units are compared where a vehicle has moved so far
 _SAME_UNITS = (0.8, 1.25)  # of the distance driven to the speed times the time
+_FEW_JUMPS = 0.05  # share of a track's rows
 _MOST_WRONG = 0.1  # share of tracks whose units may disagree: mistakes of a tracker
 _SUFFIXES = (".csv", ".xml", ".parquet", ".txt", ".gz")
 _ON_FOOT = ("pedestrian", "bicycle", "cyclist", "person", "animal", "wheelchair")  # classes without car-following
@@ -85,6 +87,7 @@ class Recorded:
     unread: tuple[Path, ...] = ()  # files of a folder that are no tracks
     short: int = 0  # pairs that are too short
     inconsistent: int = 0  # tracks whose positions and speeds disagree
+    jumps: int = 0  # moments at which a vehicle jumps; pairs end there
 
     @property
     def drivers(self) -> tuple[str, ...]:
@@ -97,6 +100,7 @@ def left_out_text(found: Recorded) -> list[str]:
     parts = [
         (found.short, "pairs that are too short"),
         (found.inconsistent, "tracks whose positions and speeds disagree"),
+        (found.jumps, "moments at which a vehicle jumps, where pairs were cut"),
         (len(found.unread), "files that are no tracks, such as " + "".join(file.name for file in found.unread[:1])),
     ]
     return [f"left out: {count:,} {what}" for count, what in parts if count]
@@ -120,7 +124,14 @@ def read_pairs(
     files, unread = _files(path, format_name)
     parts = [find_pairs(read_tracks(file, format_name), step_s, min_duration_s) for file in files]
     pairs = tuple(pair for part in parts for pair in part.pairs)
-    found = Recorded(pairs, files, unread, sum(part.short for part in parts), sum(part.inconsistent for part in parts))
+    found = Recorded(
+        pairs,
+        files,
+        unread,
+        sum(part.short for part in parts),
+        sum(part.inconsistent for part in parts),
+        sum(part.jumps for part in parts),
+    )
     if not pairs:
         rest = f"{found.short:,} are shorter than {min_duration_s:g} s" if found.short else "nobody follows anybody"
         raise InputError(f"{path} has no pair of a leader and a follower to fit ({rest}); give a longer recording")
@@ -156,16 +167,16 @@ def find_pairs(tracks: Tracks, step_s: float = STEP_S, min_duration_s: float = M
     time_s, x_m, y_m, heading_rad, speed_mps, length_m, width_m = (
         table[name].to_numpy() for name in ("time_s", "x_m", "y_m", "heading_rad", "speed_mps", "length_m", "width_m")
     )
-    driven_m = _driven_m(track, x_m, y_m)
-    wrong = _inconsistent(tracks, track, time_s, speed_mps, driven_m)
+    driven_m, jumping = _driven_m(track, x_m, y_m), jumping_rows(tracks)
+    wrong = _inconsistent(tracks, track, time_s, speed_mps, driven_m, jumping)
     drives = ~np.isin(track, wrong) & ~_on_foot(table)
     rows, begins = _by_moment(table, drives)
     reach_m, straight_m = (math.inf, math.inf) if tracks.format == "leader_follower" else (REACH_M, _STRAIGHT_M)
     leader, ahead_m = np.full(len(track), -1, np.int64), np.zeros(len(track))
-    _find_leaders(rows, begins, track, x_m, y_m, heading_rad, width_m, reach_m, straight_m, leader, ahead_m)
+    _find_leaders(rows, begins, track, x_m, y_m, heading_rad, length_m, width_m, reach_m, straight_m, leader, ahead_m)
     pairs, short = [], 0
     names = [table[name].astype(str).to_numpy() for name in ("recording", "vehicle")]
-    for first, last in _stretches(track, time_s, leader):
+    for first, last in _stretches(track, time_s, leader, jumping):
         own, other = slice(first, last), leader[first:last]
         pair = Pair(
             recording=names[0][first],
@@ -182,7 +193,7 @@ def find_pairs(tracks: Tracks, step_s: float = STEP_S, min_duration_s: float = M
             short += 1
         else:
             pairs.append(_at_step(pair, time_s[own]))
-    return Recorded(tuple(pairs), (tracks.file,), (), short, len(wrong))
+    return Recorded(tuple(pairs), (tracks.file,), (), short, len(wrong), len(jumping))
 
 
 def _on_foot(table: pd.DataFrame) -> NDArray[np.bool_]:
@@ -200,19 +211,30 @@ def _driven_m(track: NDArray[np.int64], x_m: Floats, y_m: Floats) -> Floats:
 
 
 def _inconsistent(
-    tracks: Tracks, track: NDArray[np.int64], time_s: Floats, speed_mps: Floats, driven_m: Floats
+    tracks: Tracks,
+    track: NDArray[np.int64],
+    time_s: Floats,
+    speed_mps: Floats,
+    driven_m: Floats,
+    jumping: NDArray[np.int64],
 ) -> NDArray[np.int64]:
     """Return the numbers of tracks on which vehicles move farther or less far than their speeds say.
 
+    Single jumps do not count; where there are many, the units are wrong.
+
     Raises:
-        InputError: there are so many that the units must be mixed.
+        InputError: there are so many such tracks that the units must be mixed.
     """
     begins = np.flatnonzero(np.diff(track, prepend=-1))
-    ends = np.append(begins[1:], len(track)) - 1
-    steps_m = np.diff(time_s, prepend=0.0) * (speed_mps + np.roll(speed_mps, 1)) / 2.0
-    steps_m[begins] = 0.0
-    expected_m = np.add.reduceat(steps_m, begins)
-    moved_m = driven_m[ends]
+    rows = np.diff(np.append(begins, len(track)))
+    expected_m = np.diff(time_s, prepend=0.0) * (speed_mps + np.roll(speed_mps, 1)) / 2.0
+    steps_m = np.diff(driven_m, prepend=0.0)
+    single = jumping[
+        np.bincount(track[jumping], minlength=len(rows))[track[jumping]] <= _FEW_JUMPS * rows[track[jumping]]
+    ]
+    ignored = np.concatenate([begins, single])
+    steps_m[ignored] = expected_m[ignored] = 0.0
+    moved_m, expected_m = np.add.reduceat(steps_m, begins), np.add.reduceat(expected_m, begins)
     judged = np.maximum(expected_m, moved_m) > _MOVED_M
     ratio = moved_m / np.maximum(expected_m, 1e-9)
     wrong = judged & ~((ratio >= _SAME_UNITS[0]) & (ratio <= _SAME_UNITS[1]))
@@ -244,6 +266,7 @@ def _find_leaders(
     x_m: Floats,
     y_m: Floats,
     heading_rad: Floats,
+    length_m: Floats,
     width_m: Floats,
     reach_m: float,
     straight_m: float,
@@ -266,7 +289,8 @@ def _find_leaders(
                 found_m = _along_way(row, other, 1, track, x_m, y_m, heading_rad, beside_m, nearest_m, straight_m)
                 if found_m < 0.0:
                     found_m = _along_way(other, row, -1, track, x_m, y_m, heading_rad, beside_m, nearest_m, straight_m)
-                if 0.0 < found_m < nearest_m:
+                touching_m = (length_m[row] + length_m[other]) / 2.0
+                if touching_m < found_m < nearest_m:
                     leader[row], nearest_m = other, found_m
                     ahead_m[row] = found_m
 
@@ -318,13 +342,17 @@ def _along_way(
     return found_m
 
 
-def _stretches(track: NDArray[np.int64], time_s: Floats, leader: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Yield first and last row (exclusive) of each stretch of a track with one leader and without missing frames."""
+def _stretches(
+    track: NDArray[np.int64], time_s: Floats, leader: NDArray[np.int64], jumping: NDArray[np.int64]
+) -> Iterator[tuple[int, int]]:
+    """Yield first and last row (exclusive) of each stretch of a track with one leader and without a break."""
+    jumps = np.isin(np.arange(len(track)), jumping)
+    cut = jumps | ((leader >= 0) & jumps[leader])
     leading = np.where(leader >= 0, track[leader], -1)
     same_track = track[1:] == track[:-1]
     steps_s = np.diff(time_s)
     usual_s = float(np.median(steps_s[same_track])) if same_track.any() else math.inf
-    joined = same_track & (leading[1:] == leading[:-1]) & (steps_s <= _LONG_STEP * usual_s)
+    joined = same_track & (leading[1:] == leading[:-1]) & (steps_s <= _LONG_STEP * usual_s) & ~cut[1:]
     bounds = np.concatenate([[0], np.flatnonzero(~joined) + 1, [len(track)]])
     for first, last in pairwise(bounds):
         if leading[first] >= 0 and last - first > 1:

@@ -125,8 +125,7 @@ def _faults(tracks: Tracks, steps: _Steps) -> Faults:
     track = tracks.track_number[steps.row]
     usual_s = np.median(steps.time_s) if len(steps.row) else 0.0
     too_fast = np.abs(steps.acceleration_mps2) > MOST_ACCELERATION_MPS2
-    reach_m = steps.top_speed_mps * steps.time_s + MOST_ACCELERATION_MPS2 * steps.time_s**2 / 2.0 + _JUMP_M
-    jumps = steps.distance_m > reach_m
+    jumps = _jumps(steps)
     long = steps.time_s > _LONG_STEP * usual_s
     pairs = overlapping(tracks.table)
     return Faults(
@@ -139,6 +138,18 @@ def _faults(tracks: Tracks, steps: _Steps) -> Faults:
         int(long.sum()),
         len(np.unique(track[long])),
     )
+
+
+def _jumps(steps: _Steps) -> NDArray[np.bool_]:
+    """Return in which steps a vehicle moves farther than its speeds and any acceleration allow; (S,)."""
+    reach_m = steps.top_speed_mps * steps.time_s + MOST_ACCELERATION_MPS2 * steps.time_s**2 / 2.0 + _JUMP_M
+    return np.asarray(steps.distance_m > reach_m)
+
+
+def jumping_rows(tracks: Tracks) -> NDArray[np.int64]:
+    """Return the rows at which a vehicle is farther from its row before than its speeds allow."""
+    steps = _steps(tracks)
+    return steps.row[_jumps(steps)]
 
 
 def overlapping(table: pd.DataFrame) -> pd.DataFrame:

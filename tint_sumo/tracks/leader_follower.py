@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from tint_sumo.config import VehicleShape
+from tint_sumo.core.errors import InputError
 from tint_sumo.tracks.reading import Head, TrackFormat, read_csv, register
 from tint_sumo.tracks.schema import UNKNOWN
 
@@ -19,6 +21,12 @@ _NUMBERS = ["timestamp", "xLeaderReal", "vLeaderReal", "xFollowerReal", "vFollow
 def _read(file: Path) -> Mapping[str, Any]:
     """Read a pair. Positions are taken for those of the centres; vehicles have the standard size, as none is given."""
     rows = read_csv(file, _NUMBERS, ["run_no", "leader_id", "follower_id"])
+    behind = np.flatnonzero(rows["xLeaderReal"].to_numpy() <= rows["xFollowerReal"].to_numpy())
+    if len(behind):
+        raise InputError(
+            f"{file}, row {behind[0] + 1}: the leader is not ahead of its follower; give positions that grow along "
+            "the way"
+        )
     shape = VehicleShape()
     return {
         "recording": pd.concat([rows["run_no"]] * 2, ignore_index=True),

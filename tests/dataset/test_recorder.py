@@ -1,5 +1,6 @@
 """Recording, with real simulations."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import pandas as pd
 import pytest
 
 from tests.simulation.scenes import T
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, Mix
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, POPULATIONS, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.recorder import (
     EPISODE_STEPS,
@@ -216,6 +217,17 @@ def test_a_folder_of_another_run_is_left_alone(dataset: Path, tmp_path: Path) ->
     with pytest.raises(InputError, match="already holds other files"):
         record(tmp_path, WINDOWS)
     assert [file.name for file in tmp_path.iterdir()] == ["letters.txt"]
+
+
+def test_traits_of_drivers_whose_willingness_changes_are_their_profiles() -> None:
+    population = replace(POPULATIONS["inattentive"], members=2)
+    simulation = SceneSimulation(2, replace(T, population=population), with_ego=False)
+    try:
+        _, drivers = simulate_episodes(simulation, 0, 0, steps=100)
+    finally:
+        simulation.close()
+    assert (drivers["trait"].astype(str) == drivers["vtype"].str.split(".").str[0]).all()
+    assert set(drivers["trait"]) == {"conservative", "aggressive"}
 
 
 def test_drivers_without_classes_are_recorded_by_the_same_command(tmp_path: Path) -> None:

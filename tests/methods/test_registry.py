@@ -27,8 +27,9 @@ from tint_sumo.methods.registry import (
     no_traits,
     register,
 )
+from tint_sumo.methods.rules import TimeToCollision
 from tint_sumo.policy import ClassifierTraits, EncoderTraits, NoTraits, OracleTraits, StreamingTraits
-from tint_sumo.scenes import paper_scene
+from tint_sumo.scenes import find_scene, paper_scene
 from tint_sumo.traits import TraitModel
 
 LEARNED = learned_methods()
@@ -98,6 +99,16 @@ def test_rules_act() -> None:
         if isinstance(method, Rule):
             actions, _ = method.make(paper_scene()).predict(observation)
             assert actions.shape == (3,)
+
+
+@pytest.mark.parametrize(("scene", "wanted_s"), [("t_intersection", 1.2), ("t_intersection_street", 4.0)])
+def test_the_gap_that_ttc_waits_for_is_that_of_the_scene(scene: str, wanted_s: float) -> None:
+    ttc = find_method("ttc")
+    assert isinstance(ttc, Rule)
+    shorter = replace(find_scene(scene), base=scene, name="shorter", time_limit_s=20.0)
+    for played in (find_scene(scene), shorter):
+        policy = ttc.make(played)
+        assert isinstance(policy, TimeToCollision) and policy.threshold_s == wanted_s
 
 
 def test_sumo_s_driver_is_a_rule_that_gives_the_ego_to_sumo(user_network: Callable[[str], UserNetwork]) -> None:

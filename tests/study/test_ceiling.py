@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from tests.simulation.scenes import GO, LOWER, UPPER, T, scene, until
-from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, DriverProfile, Mix
+from tint_sumo.config import AGGRESSIVE, CONSERVATIVE, POPULATIONS, DriverProfile, Mix, Willingness
 from tint_sumo.scenes import Scene
 from tint_sumo.scenes.layout import layout
 from tint_sumo.simulation import SceneSimulation
@@ -63,6 +63,17 @@ def test_a_lane_opens_when_the_vehicle_before_the_yielding_driver_has_passed() -
     ((opens_s, closes_s),) = upper
     assert opens_s == pytest.approx(drive_s(3.0 + LENGTH_M, AGGRESSIVE), abs=0.15)
     assert closes_s == pytest.approx(drive_s(14.4, CONSERVATIVE), abs=0.3)
+
+
+@pytest.mark.parametrize("population", ["traits", "gentle"])
+def test_a_driver_counts_if_it_would_have_yielded_before_it_came_close(population: str) -> None:
+    played = replace(T, population=POPULATIONS[population])
+    with street((LOWER, CONSERVATIVE, 9.6), played=played) as simulation:
+        (lower, upper) = _openings(simulation)[0]
+    assert len(lower) == 1 and upper == []
+    unwilling = replace(T, population=replace(T.population, willingness=Willingness(probability=0.0)))
+    with street((LOWER, CONSERVATIVE, 9.6), played=unwilling) as simulation:
+        assert _openings(simulation)[0] == [[], []]
 
 
 def test_drivers_that_do_not_yield_or_have_come_already_open_nothing() -> None:

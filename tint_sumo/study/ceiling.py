@@ -66,11 +66,13 @@ def way_m(layout: Layout) -> NDArray[np.float64]:
 def _openings(simulation: SceneSimulation) -> list[list[list[tuple[float, float]]]]:
     """Find for each replica and route from when to when the next driver at the ego's way is one that yields.
 
+    A driver whose willingness changes counts if it would have yielded to an ego at any time.
     The replicas are driven to their time limit.
     """
     scene, slots, stop_line_m = simulation.scene, simulation.slots, simulation.layout.zones.stop_line_m
     routes, length_m = range(len(stop_line_m)), scene.vehicle.length_m
     openings: list[list[list[tuple[float, float]]]] = [[[] for _ in routes] for _ in range(simulation.replicas)]
+    would = simulation.yielding.yields
     free_since_s = np.zeros((simulation.replicas, len(routes)))  # time at which the last vehicle had passed
     for step in range(round(scene.time_limit_s / scene.step_s)):
         number, past_m = slots.vehicle_number.copy(), slots.front_m - stop_line_m[slots.route]
@@ -80,9 +82,9 @@ def _openings(simulation: SceneSimulation) -> list[list[list[tuple[float, float]
         now_past_m = slots.front_m - stop_line_m[slots.route]
         for replica, slot in np.argwhere(same & (past_m < length_m) & (now_past_m >= length_m)).tolist():
             free_since_s[replica, slots.route[replica, slot]] = time_s
-        yields = simulation.yielding.yields
+        would = simulation.yielding.yields | (would & same)
         for replica, slot in np.argwhere(same & (past_m < 0.0) & (now_past_m >= 0.0)).tolist():
-            if yields[replica, slot]:
+            if would[replica, slot]:
                 route = slots.route[replica, slot]
                 openings[replica][route].append((float(free_since_s[replica, route]), time_s))
     return openings

@@ -1,6 +1,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,14 @@ def test_rules_drive_in_sumo_configurations_with_any_desired_speeds_and_sumo_s_d
     for name in ("always_go", "ttc"):
         assert found[name].rate("red_light").value > 0.0
         assert found[name].outcomes == ("success", "timeout", "collision", "red_light")
+    costly = load_policy("always_go", scene=replace(scene, red_light="cost"))
+    for repeat in (1, 4):  # a decision costs as much as its steps
+        driver = replace(costly, action_repeat=repeat)
+        evaluation = evaluate(driver.policy, partial(driver.make_venv, task=driver.task), 4, 0, batch=1)
+        assert [case.outcome for case in evaluation.cases] == ["success"] * 4
+        assert evaluation.cost == evaluation.summary()["cost"] == 2.0, "both lights of its way are red"
+    assert found["always_go"].cost is None
+    assert "cost" not in found["always_go"].summary()
     assert "give a .sumocfg as the scene" in refused("sumo")
     assert "give a .sumocfg as the scene" in refused("sumo", scene="on_ramp")
 

@@ -174,6 +174,8 @@ class EvaluatePolicy(NetworkCommand, SpreadCommand):
         ]
         time_s = evaluation.navigation_time_s
         lines.append("no success" if time_s is None else f"navigation time {time_s:.1f} s")
+        if evaluation.cost is not None:
+            lines.append(f"driven over at red {evaluation.cost:.2f} stop lines per case")
         content = {"model": self.model, **content_of(task), "seed": self.seed, **evaluation.summary()}
         return Outcome("\n".join(lines), content)
 

@@ -13,7 +13,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.statistics import Rate
-from tint_sumo.envs.rows import BUILT_IN_OUTCOMES, OUTCOMES, Outcome
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES, COST, OUTCOMES, Outcome
 from tint_sumo.methods.registry import Policy
 
 # Seed of the first case. Training draws its environments' seeds below this number, so no case is ever trained on.
@@ -35,11 +35,12 @@ class Case:
     trait: str | None = None  # trait of the driver that was hit
     route: str | None = None  # route of that driver
     town: int | None = None  # number of the episode's town
+    cost: float | None = None  # sum of the costs of its steps; None where there are no costs
 
     def stored(self) -> tuple[Any, ...]:
-        """Return the case as files hold it: with its town only if there are towns."""
-        values = astuple(self)
-        return values[:-1] if self.town is None else values
+        """Return the case as files hold it: with its town only if there are towns; costs are in no files."""
+        *values, town, _ = astuple(self)
+        return tuple(values) if town is None else (*values, town)
 
 
 _Time = Annotated[float, Range(0.0, 1e6)]
@@ -71,6 +72,12 @@ class Evaluation:
         return float(np.mean(times_s)) if times_s else None
 
     @property
+    def cost(self) -> float | None:
+        """Mean cost of an episode; None where there are no costs."""
+        costs = [case.cost for case in self.cases if case.cost is not None]
+        return float(np.mean(costs)) if costs else None
+
+    @property
     def collisions(self) -> dict[str, int]:
         """Number of collisions by trait and route of the driver that was hit, as ``"aggressive, lower"``."""
         hits = Counter(f"{case.trait}, {case.route}" for case in self.cases if case.outcome == "collision")
@@ -85,6 +92,7 @@ class Evaluation:
             "episodes": len(self.cases),
             "navigation_time_s": self.navigation_time_s,
             "collisions": self.collisions,
+            **({} if self.cost is None else {"cost": self.cost}),
         }
 
 
@@ -145,14 +153,15 @@ def _first_episodes(policy: Policy, venv: VecEnv, first_seed: int, wanted: int) 
     """Yield index and first episode of each of the first ``wanted`` environments, as they end."""
     venv.seed(first_seed)
     observation: Any = venv.reset()
-    state, starts = None, np.ones(venv.num_envs, bool)
+    state, starts, costs = None, np.ones(venv.num_envs, bool), np.zeros(venv.num_envs)
     running = np.arange(venv.num_envs) < wanted
     while running.any():
         actions, state = policy.predict(observation, state=state, episode_start=starts, deterministic=True)
         observation, _, starts, infos = venv.step(np.where(running, actions, _STOP))
+        costs += [info.get(COST, 0.0) for info in infos]
         ended = np.flatnonzero(starts & running).tolist()
         for index in ended:
-            yield index, _case(infos[index])
+            yield index, _case(infos[index], float(costs[index]))
         if ended:
             running &= ~starts
             venv.env_method("park", indices=ended)
@@ -164,6 +173,14 @@ def _shares(cases: Collection[Case]) -> dict[str, float]:
     return {outcome: ends[outcome] / len(cases) for outcome in ("success", "collision")}
 
 
-def _case(info: dict[str, Any]) -> Case:
+def _case(info: dict[str, Any], cost: float) -> Case:
+    """Return the case that an episode's last info ends, with the sum of its costs."""
     hit = info.get("collision", {})
-    return Case(info["outcome"], round(info["time_s"], 3), hit.get("trait"), hit.get("route"), info.get("town"))
+    return Case(
+        info["outcome"],
+        round(info["time_s"], 3),
+        hit.get("trait"),
+        hit.get("route"),
+        info.get("town"),
+        cost if COST in info else None,
+    )

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.episodes import TaskSettings
+from tint_sumo.envs.rows import COST
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy.trait_sources import Frame, Observation, OracleTraits, TraitSource
 
@@ -98,7 +99,7 @@ def _dictionary(observation: Any) -> Observation:
 
 
 class ActionRepeat(VecEnvWrapper):
-    """Wrapper that takes each action for ``repeat`` steps and returns the sum of their rewards.
+    """Wrapper that takes each action for ``repeat`` steps and returns the sum of their rewards, and of their costs.
 
     An episode that ends within a decision ends the decision; the next episode then waits, with desired speed 0, for
     the rest of it. The controller and its safety check go on working at every step.
@@ -143,6 +144,8 @@ class ActionRepeat(VecEnvWrapper):
             observation, rewards, done, infos = self.venv.step(np.where(ended, _STOP, self._actions))
             total += np.where(ended, 0.0, rewards)
             for index in np.flatnonzero(~ended):
+                if COST in infos[index]:
+                    infos[index][COST] += last[index].get(COST, 0.0)
                 last[index] = infos[index]
             ended |= done
             if self._on_step is not None:

@@ -17,7 +17,9 @@ Make = Callable[[str], UserNetwork]
 @pytest.fixture(scope="module")
 def rule(user_network: Make) -> NetworkTimeToCollision:
     controller = EgoController((0.0, 4.0, 8.0))
-    return NetworkTimeToCollision(user_network("merge").scene(controller=controller), threshold_s=2.0, margin_m=0.5)
+    return NetworkTimeToCollision(
+        user_network("merge").scene(controller=controller, sight_m=2 * POSITION_SCALE_M), threshold_s=2.0, margin_m=0.5
+    )
 
 
 def seen(at_m: tuple[float, float], ego_mps: tuple[float, float] = (8.0, 0.0)) -> Observation:

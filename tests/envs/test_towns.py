@@ -76,6 +76,15 @@ def test_each_environment_of_a_vector_has_the_rows_of_a_single_one(workers: int,
     assert np.transpose(towns).tolist() == alone
 
 
+def test_a_seed_begins_a_row_in_a_vector_too() -> None:
+    with closing(SceneVectorEnv(2, IN_ROWS)) as vector:
+        _, first = vector.reset(seed=5)
+        vector.reset()
+        _, again = vector.reset(seed=5)
+        towns = [again["town"].tolist()] + [vector.reset()[1]["town"].tolist() for _ in range(ROW)]
+    assert first["town"].tolist() == towns[0] == towns[ROW - 1] != towns[ROW]
+
+
 def test_only_environments_that_are_reset_show_their_town() -> None:
     with closing(SceneVectorEnv(2, IN_ROWS)) as vector:
         vector.reset(seed=0)

@@ -81,6 +81,10 @@ def test_a_driver_is_willing_as_long_as_its_limit_of_braking_stops_it() -> None:
         assert found.willing.tolist() == [[willing]]
     woke = found.follow(np.zeros(1), np.zeros(1, bool))  # it has stopped there
     assert woke.tolist() == [[True]]
+    slots.front_m[0, 0] = stop_line_m - 0.9 * needed_m
+    for speed_mps, willing in ((2.0, False), (1.5, True)):  # already where it enters
+        found.enter(0, 0, 0, speed_mps, 0.0)
+        assert found.willing.tolist() == [[willing]]
     many, _ = states(300, braking_mps2=(1.0, 4.0))
     assert 1.0 <= many._braking_mps2.min() < 1.1 and 3.9 < many._braking_mps2.max() <= 4.0
 
@@ -111,6 +115,19 @@ def test_a_driver_s_attention_follows_from_its_seed() -> None:
             history.append(bool(found.willing[0, others]))
         histories.append(history)
     assert histories[0] == histories[1] and 10 < sum(histories[0]) < 90
+
+
+def test_after_a_reset_nobody_remembers_that_the_ego_has_waited() -> None:
+    simulation = SceneSimulation(1, replace(T, population=replace(POPULATIONS["polite"], members=2)))
+    with closing(simulation):
+        histories = []
+        for _ in range(2):
+            simulation.reset(0, 5)
+            histories.append([])
+            for _ in range(100):
+                histories[-1].append(simulation.traits()[0].tolist())
+                simulation.step(np.array([STOP]))
+    assert histories[0] == histories[1] and len(set(map(str, histories[0]))) > 5
 
 
 def drive(scene: Scene, seed: int, x_m: float = 3.0) -> tuple[SceneSimulation, list[bool], list[int]]:

@@ -38,6 +38,7 @@ from tint_sumo.policy import ClassifierTraits, EncoderTraits, OracleTraits, Recu
 from tint_sumo.policy.loss import PpoLoss, ppo_loss
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.storage import load_policy_network, read_policy_card
+from tint_sumo.scenes import read_scene
 from tint_sumo.traits.storage import save
 
 SNAPSHOTS = ["policy-25.json", "policy-25.safetensors", "policy-50.json", "policy-50.safetensors"]
@@ -241,6 +242,19 @@ def test_an_interrupted_run_ends_with_the_very_same_policy(method: str, tmp_path
             train(resumed, report=interrupt_at(steps), film=look)
         torch.manual_seed(steps)  # another process has other random numbers
     train(resumed, report=draw, film=look)
+    assert_same_training(resumed, at_a_stretch)
+
+
+def test_an_interrupted_run_goes_on_in_the_towns_where_it_was(tmp_path: Path, brief: PpoSettings) -> None:
+    towns = {"base": "towns", "members": 1, "towns": {"count": 40, "episodes": 5}}
+    scene = read_scene({"base": "t_intersection", "population": towns})
+    train = partial(train_policy, "oracle", Mix(0.4), 256, 0, settings=brief, scene=scene)
+    at_a_stretch, resumed = tmp_path / "at_a_stretch", tmp_path / "resumed"
+    train(at_a_stretch)
+    for steps in (64, 192):
+        with pytest.raises(KeyboardInterrupt):
+            train(resumed, report=interrupt_at(steps))
+    train(resumed)
     assert_same_training(resumed, at_a_stretch)
 
 

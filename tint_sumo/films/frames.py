@@ -151,7 +151,7 @@ def _wanted(moment: Moment) -> str:
     """Draw the action and the value of the policy."""
     parts = [f"speed {moment.ego_mps:.1f} m/s"]
     if moment.desired_mps is not None:
-        parts.append(f"action: wants {moment.desired_mps:g} m/s")
+        parts.append(f"action: wants {moment.desired_mps:.3g} m/s")
     if moment.value is not None:
         parts.append(f"value {moment.value:+.2f}")
     return "     ".join(parts)

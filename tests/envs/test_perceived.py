@@ -169,6 +169,25 @@ def test_stable_baselines_gets_keys_costs_and_outcomes(scene: SumocfgScene) -> N
         assert venv.step(np.array([STOP]))[3][0]["cost"] == 0.0
 
 
+def test_costs_of_an_episode_s_last_step_are_kept(scene: SumocfgScene) -> None:
+    costly = replace(scene, red_light="cost")
+    with closing(SceneEnv(TaskSettings(costly))) as env:
+        last_s = next(info["time_s"] for *_, info in steps_of(env) if info["cost"])
+    task = TaskSettings(costly, time_limit_s=last_s)
+    with closing(SceneVecEnv(1, task, seed=1)) as venv:
+        venv.reset()
+        done, costs = np.array([False]), []
+        while not done[0]:
+            _, _, done, infos = venv.step(np.array([GO]))
+            costs.append(infos[0]["cost"])
+    assert costs == [0.0] * (len(costs) - 1) + [1.0]
+    with closing(SceneVectorEnv(1, task, autoreset_mode="SameStep")) as vector:
+        vector.reset(seed=1)
+        for _ in costs:
+            *_, last = vector.step(np.array([GO]))
+    assert last["final_info"]["cost"].tolist() == [1.0]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -22,7 +22,7 @@ class SceneVecEnv(VecEnv):
 
     ``settings`` and ``workers`` are as in ``SceneVectorEnv``.
     ``infos[i]`` holds ``traits``, the true traits that go with the returned observation, and with towns ``town``, the
-    number of the town of the episode that made the step; when an episode ends also
+    number of the town of the episode that made the step, and ``cost`` where red lights cost; when an episode ends also
     ``terminal_observation``, ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``is_success``, ``time_s`` and,
     after a collision, ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then; without
     ``autoreset`` it has not, and the environment shows the end of its episode until it is parked or all are reset.
@@ -82,6 +82,7 @@ class SceneVecEnv(VecEnv):
                 "outcome": end.outcome,
                 "time_s": last["time_s"],
                 **town_info(last["town"]),
+                **{name: last[name] for name in contents.step_infos},
                 **end_info(end.outcome, end.collision),
             }
         done = rows["terminated"] | rows["truncated"]

@@ -58,7 +58,7 @@ class Evaluation:
 
     @property
     def outcomes(self) -> tuple[str, ...]:
-        """The outcomes to show: those of built-in scenes, and ``lost`` where it happened."""
+        """The outcomes to show: those of built-in scenes, and others that happened."""
         happened = {case.outcome for case in self.cases}
         return tuple(outcome for outcome in OUTCOMES if outcome in BUILT_IN_OUTCOMES or outcome in happened)
 

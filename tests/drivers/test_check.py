@@ -1,6 +1,7 @@
 """Fitted drivers drive like the recorded ones, and SUMO's defaults do not."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from tests.drivers.conftest import KnownFit
 from tests.drivers.recordings import population, simulated_pair
 from tint_sumo.core.progress import Progress
-from tint_sumo.drivers.check import DEFAULT, POPULATION, SAME, TOOL, Check, check, quantities, report_text
+from tint_sumo.drivers.check import DEFAULT, POPULATION, SAME, TOOL, Check, check, drawn_types, quantities, report_text
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +53,16 @@ def test_quantities_are_those_of_the_trajectory() -> None:
     np.testing.assert_allclose(found["acceleration"], [1.0, 3.0, 5.0, 7.0])
     np.testing.assert_allclose(found["jerk"], [2.0, 2.0, 2.0])
     assert len(quantities(pair, pair.front_m, np.zeros(41))["time gap"]) == 0  # of a vehicle that stands
+
+
+def test_drivers_want_to_drive_as_fast_as_the_follower_does(known: KnownFit) -> None:
+    pairs = [replace(known.pairs[0], speed_mps=np.full(400, speed_mps)) for speed_mps in (5.0, 31.0)]
+    population = known.fitted.population.population
+    xml = drawn_types(known.fitted, pairs, [population.any_pair] * 2, 10, 0, 30.0)
+    types = list(ElementTree.fromstring(f"<types>{xml}</types>"))
+    assert [one.attrib["id"] for one in types] == [str(number) for number in range(20)]
+    speeds_mps = np.array([float(one.attrib["maxSpeed"]) for one in types])
+    assert speeds_mps[:10].min() < 31.0 <= speeds_mps[10:].min()
 
 
 def test_the_report_has_a_line_for_each_distance(checked: Check) -> None:

@@ -1,12 +1,28 @@
 """The population draws drivers together as far as they are alike, and its intervals hold what is true."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import pytest
 
 from tests.drivers.conftest import KnownFit
-from tint_sumo.drivers.fitting import Estimate
-from tint_sumo.drivers.models import MODELS
-from tint_sumo.drivers.population import Evidence, Noise, Population, draws, next_pair, posterior, predicted_gap_m
+from tests.drivers.recordings import simulated_pair
+from tint_sumo.drivers import prediction
+from tint_sumo.drivers.fitting import Estimate, gap_errors_m
+from tint_sumo.drivers.models import MODELS, CarFollowing, Floats
+from tint_sumo.drivers.pairs import Pair
+from tint_sumo.drivers.population import (
+    Evidence,
+    Noise,
+    Population,
+    draws,
+    evidence,
+    moments,
+    next_pair,
+    posterior,
+    predicted_gap_m,
+    prior,
+)
 from tint_sumo.drivers.prediction import predict_each
 
 BETWEEN, WITHIN = np.diag([0.2, 0.1, 0.1, 0.1, 0.1]), np.diag([0.05, 0.1, 0.2, 0.1, 0.1])
@@ -33,6 +49,44 @@ def test_a_driver_without_pairs_is_as_the_population() -> None:
     found = posterior(POPULATION, [])
     np.testing.assert_allclose(found.log_parameters, POPULATION.mean)
     np.testing.assert_allclose(found.covariance, BETWEEN)
+
+
+def test_the_deviations_of_pairs_are_those_of_the_joint_distribution() -> None:
+    """Driver and pairs together are one normal distribution, whose precision is written down here."""
+    found, inverse = [seen(0.6, 0.1), seen(-0.2, 0.3)], np.linalg.inv(WITHIN)
+    precision, shift = np.zeros((15, 15)), np.zeros(15)
+    precision[:5, :5] = np.linalg.inv(BETWEEN) + 2.0 * inverse
+    shift[:5] = np.linalg.solve(BETWEEN, POPULATION.mean)
+    for first, one in ((5, found[0]), (10, found[1])):
+        own = slice(first, first + 5)
+        precision[own, own], shift[own] = inverse + one.precision, one.shift
+        precision[:5, own] = precision[own, :5] = -inverse
+    covariance = np.linalg.inv(precision)
+    mean, expected = covariance @ shift, np.zeros((5, 5))
+    for own in (slice(5, 10), slice(10, 15)):
+        off = mean[own] - mean[:5]
+        crossed = covariance[own, :5]
+        expected += np.outer(off, off) + covariance[own, own] + covariance[:5, :5] - crossed - crossed.T
+    driver, spread = moments(POPULATION, found)
+    np.testing.assert_allclose(driver.log_parameters, mean[:5])
+    np.testing.assert_allclose(driver.covariance, covariance[:5, :5], atol=1e-12)
+    np.testing.assert_allclose(spread, expected, atol=1e-12)
+
+
+def test_what_a_pair_says_is_its_posterior_less_the_population() -> None:
+    """Compared with 10,000 drivers of the population, each weighted with its likelihood."""
+    model, noise = MODELS["IDM"], Noise(0.9, 1.0)
+    usual = Population(model.usual, 0.02 * np.eye(5), 0.02 * np.eye(5), noise)
+    pair = simulated_pair(model.usual + 0.3, 3, 150)
+    found = evidence(model, pair, usual, [model.usual])
+    inverse = np.linalg.inv(usual.total)
+    mean = np.linalg.solve(inverse + found.precision, found.shift + inverse @ usual.mean)
+    drawn = np.random.default_rng(0).multivariate_normal(usual.mean, usual.total, 10_000)
+    errors = [noise.whitened(gap_errors_m(model, pair, z)[::10]) for z in drawn]
+    weights = np.exp([-float(one @ one) / 2.0 for one in errors])
+    expected = weights @ drawn / weights.sum()
+    assert np.abs(expected - usual.mean).max() > 0.1
+    np.testing.assert_allclose(mean, expected, atol=0.03)
 
 
 def test_noise_is_whitened() -> None:
@@ -83,6 +137,25 @@ def test_drivers_are_predicted_better_from_their_other_pair_than_from_the_popula
     for one in found.values():
         assert one.fitted < one.posterior
         assert one.fitted < one.other_pair < one.sumo
+
+
+def test_predictions_use_nothing_of_their_pair(known: KnownFit, monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs, used = known.pairs[:4], []
+    fits = {pair.name: pair.fit.estimate for pair in known.fitted.pairs}
+
+    def fit(model: CarFollowing, others: Sequence[Pair], modes: Mapping[str, Floats]) -> Population:
+        used.append({pair.name for pair in others} | set(modes))
+        return prior(model)
+
+    def look(model: CarFollowing, pair: Pair, population: Population, starts: Sequence[Floats]) -> Evidence:
+        used.append({pair.name})
+        return evidence(model, pair, population, starts)
+
+    monkeypatch.setattr(prediction, "fit_population", fit)
+    monkeypatch.setattr(prediction, "evidence", look)
+    predict_each(MODELS["IDM"], pairs, fits)
+    a, b, c, d = (pair.name for pair in pairs)
+    assert used == [{c, d}, {b}, {a}, {a, b}, {d}, {c}]
 
 
 def test_predictions_are_the_median_of_draws(known: KnownFit) -> None:

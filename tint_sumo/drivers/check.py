@@ -113,10 +113,10 @@ def check(
     one = fitted.population.population
     known = {driver.name: next_pair(one, driver.fit.estimate) for driver in fitted.drivers}
     ids = [f"{index}" for index in range(len(pairs) * repeats)]
-    sources = {POPULATION: (_drawn_types(fitted, pairs, [one.any_pair] * len(pairs), repeats, seed, limit_mps), ids)}
+    sources = {POPULATION: (drawn_types(fitted, pairs, [one.any_pair] * len(pairs), repeats, seed, limit_mps), ids)}
     if all(pair.driver in known for pair in pairs):
         own = [known[pair.driver] for pair in pairs]
-        sources[SAME] = (_drawn_types(fitted, pairs, own, repeats, seed, limit_mps), ids)
+        sources[SAME] = (drawn_types(fitted, pairs, own, repeats, seed, limit_mps), ids)
     sources[DEFAULT] = ("", ["DEFAULT_VEHTYPE"] * len(ids))
     sources[TOOL] = (_by_tool(seed), ["vehDist"] * len(ids))
     repeated = [pair for pair in pairs for _ in range(repeats)]
@@ -132,10 +132,13 @@ def check(
     return Check(len(pairs), len(names), repeats, limit_mps, _distances(indices, recorded, simulated))
 
 
-def _drawn_types(
+def drawn_types(
     fitted: Fitted, pairs: Sequence[Pair], known: Sequence[Estimate], repeats: int, seed: int, speed_limit_mps: float
 ) -> str:
-    """Return vTypes 0, 1, ... for each pair and repeat, drawn from what is known of the pair."""
+    """Return vTypes 0, 1, ... for each pair and repeat, drawn from what is known of the pair.
+
+    They want to drive at least as fast as the follower does first, if such drivers are among those that are drawn.
+    """
     model, types = fitted.car_following, []
     speed = fitted.parameters.index("desired_speed_mps")
     for index, (pair, estimate) in enumerate(zip(pairs, known, strict=True)):

@@ -136,7 +136,7 @@ _LEADER_MPS2 = 4.5
 def _bounded(speed: float, wanted: float, desired: float, accel: float, decel: float, step_s: float) -> float:
     """Return the next speed: the wanted one within what the vehicle's acceleration and braking allow."""
     planned = min(wanted, desired)
-    hardest = max(speed - max(_EMERGENCY_MPS2, decel) * step_s, 0.0)
+    hardest = max(speed - _EMERGENCY_MPS2 * step_s, 0.0)  # or with decel, if that is more
     least = min(max(speed - decel * step_s, 0.0), max(planned, hardest))
     return max(least, min(planned, speed + accel * step_s, desired))
 

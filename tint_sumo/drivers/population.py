@@ -221,17 +221,17 @@ def iterate(model: CarFollowing, pairs: Sequence[Pair], state: Iteration, report
     for pair in pairs:
         by_driver.setdefault(pair.driver, []).append(found[pair.name])
     start = prior(model)
-    moments = [_moments(population, evidences) for evidences in by_driver.values()]
-    mean = np.mean([driver.log_parameters for driver, _ in moments], axis=0)
-    off = np.array([driver.log_parameters - mean for driver, _ in moments])
-    between = off.T @ off + np.sum([driver.covariance for driver, _ in moments], axis=0)
-    within = np.sum([spread for _, spread in moments], axis=0)
+    drivers = [moments(population, evidences) for evidences in by_driver.values()]
+    mean = np.mean([driver.log_parameters for driver, _ in drivers], axis=0)
+    off = np.array([driver.log_parameters - mean for driver, _ in drivers])
+    between = off.T @ off + np.sum([driver.covariance for driver, _ in drivers], axis=0)
+    within = np.sum([spread for _, spread in drivers], axis=0)
     every = max(1, round(SPACING_S / pairs[0].step_s))
     errors_m = [gap_errors_m(model, pair, found[pair.name].mode)[::every] for pair in pairs]
     correlation, deviation_m = autocorrelation(errors_m)
     updated = Population(
         mean,
-        (between + PRIOR_WEIGHT * start.between) / (len(moments) + PRIOR_WEIGHT),
+        (between + PRIOR_WEIGHT * start.between) / (len(drivers) + PRIOR_WEIGHT),
         (within + PRIOR_WEIGHT * start.within) / (len(pairs) + PRIOR_WEIGHT),
         Noise(correlation, max(deviation_m, _LEAST_DEVIATION_M)),
     )
@@ -240,7 +240,7 @@ def iterate(model: CarFollowing, pairs: Sequence[Pair], state: Iteration, report
     return Iteration(number, updated, {name: one.mode for name, one in found.items()}, is_last)
 
 
-def _moments(population: Population, found: Sequence[Evidence]) -> tuple[Estimate, Floats]:
+def moments(population: Population, found: Sequence[Evidence]) -> tuple[Estimate, Floats]:
     """Return a driver's parameters, and the expected sum of squares of its pairs' deviations from them; (P, P)."""
     driver = posterior(population, found)
     inverse = np.linalg.inv(population.within)

@@ -16,7 +16,6 @@ from tint_sumo.config import SENSORS, Sensor
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.pedestrians import PEDESTRIANS
 from tint_sumo.envs.scene_env import SceneEnv
-from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.scenes import SumocfgScene
 from tint_sumo.simulation import SumocfgSimulation
 
@@ -104,11 +103,6 @@ def test_noise_is_on_positions_and_follows_from_the_seed_alone(scene: SumocfgSce
     runs = [[one for one, _ in episode(scene, sensor, backend=backend)] for backend in ("libsumo", "traci")]
     for one, other in zip(*runs, strict=True):
         assert_equal(one, other)
-    with closing(SceneVectorEnv(2, TaskSettings(scene, sensor=sensor), workers=2)) as vector:
-        observations, _ = vector.reset(seed=0)
-        for one in runs[0][:30]:
-            assert_equal({key: values[1] for key, values in observations.items()}, one)
-            observations, *_ = vector.step(np.array([1, 1]))
     errors = []
     exact = episode(scene, Sensor(range_m=100.0))
     for (true, _), noisy in zip(exact, [one for one, _ in episode(scene, Sensor(noise_m=0.1))], strict=True):

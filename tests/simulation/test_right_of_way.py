@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,8 @@ Make = Callable[..., SumocfgScene]
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Make:
     """Return a function that makes a crossing of a main road, from west to east, with a minor one."""
 
-    def make(kind: str, *ego_route: str, step_s: float = 0.5) -> SumocfgScene:
+    @cache
+    def make(kind: str, *ego_route: str) -> SumocfgScene:
         folder: Path = tmp_path_factory.mktemp(kind)
         nodes = "".join(f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in _AT.items())
         edges = "".join(
@@ -41,7 +43,7 @@ def crossing(tmp_path_factory: pytest.TempPathFactory) -> Make:
             if not way.startswith(ego_route[0])
         )
         (folder / "x.rou.xml").write_text(f"<routes>{vehicles}</routes>")
-        sumocfg = write_config(folder / "x.sumocfg", net.name, "x.rou.xml", f'<step-length value="{step_s}"/>')
+        sumocfg = write_config(folder / "x.sumocfg", net.name, "x.rou.xml", '<step-length value="0.5"/>')
         return from_sumocfg(
             sumocfg,
             ego_route,

@@ -33,6 +33,8 @@ RULES = ("always_go", "ttc", "sumo")
 OUTCOMES = ("success", "timeout", "collision", "red_light", "lost")
 _GRID = "--grid --grid.number 4 --grid.length 150 --grid.attach-length 150 -L 2 --default-junction-type traffic_light"
 _FLOW = '<flow id="{0}" from="{0}" to="{1}" begin="0" end="3600" period="exp(0.08)" departSpeed="max"/>'
+# A single environment needs no other process: on busy cores, processes wait for each other.
+_ALONE: dict[str, Any] = {"n_envs": 1, "n_steps": 256, "n_minibatches": 1, "n_epochs": 8, "learning_rate": 2e-3}
 _REPORT_EVERY = 5000  # decisions
 
 
@@ -108,8 +110,7 @@ def grid(folder: Path) -> Network:
 def _slow_decisions(scene: SumocfgScene) -> PpoSettings:
     """Return settings with decisions every 0.8 s: the ego waits for lights for long."""
     usual = network_ppo(scene.step_s)
-    repeat = 2 * usual.action_repeat
-    return replace(usual, n_envs=1, n_steps=256, n_minibatches=1, n_epochs=8, learning_rate=2e-3, action_repeat=repeat)
+    return replace(usual, **_ALONE, action_repeat=2 * usual.action_repeat)
 
 
 NETWORKS = {make.__name__: make for make in (motorway, braunschweig, grid)}

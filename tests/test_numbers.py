@@ -228,6 +228,24 @@ def test_the_page_on_calibration_has_the_measured_numbers() -> None:
     assert f"takes {measured.loc[('time', 'fit of all pairs'), 'value']:.0f} s on one core" in _prose(str(page))
 
 
+def test_the_table_of_own_networks_is_that_of_the_results() -> None:
+    (table,) = (one for one in _tables(DOCS / "how-to" / "own-network.md") if "`no_labels`" in one)
+    head, _, *lines = table.strip().split("\n")
+    measured = pandas.read_csv(RESULTS / "own_networks.csv").set_index(["network", "method"])
+    names = ["success", "timeout", "collision", "red_light"]
+    assert {line.split(" | ")[0].strip("| ") for line in lines} == set(measured.index.get_level_values(0))
+    for line in lines:
+        network, *cells = line.strip("| ").split(" | ")
+        for method, cell in zip(re.findall("`(.*?)`", head), cells, strict=True):
+            if (network, method) not in measured.index:
+                assert cell == "-"
+                continue
+            row = measured.loc[(network, method)]
+            assert row["lost_percent"] == 0.0
+            time = "-" if pandas.isna(row["time_s"]) else f"{row['time_s']:.1f} s"
+            assert cell == f"{' / '.join(str(row[f'{name}_percent']) for name in names)}, {time}"
+
+
 def _outcomes(row: pandas.Series) -> str:
     return " / ".join(str(row[f"{outcome}_percent"]) for outcome in BUILT_IN_OUTCOMES)
 

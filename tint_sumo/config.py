@@ -36,6 +36,7 @@ OBSERVATION_BOUND = 2.0  # of normalised observations: 40 m, 6 m/s
 
 Backend = Literal["auto", "libsumo", "traci"]
 EgoControl = Literal["speed", "sumo"]
+CarFollowing = Literal["IDM", "EIDM", "Krauss", "ACC", "CACC"]
 RedLight = Literal["ignore", "cost", "end"]
 Perceivable = Literal["traffic_light", "right_of_way", "speed_limit", "lane", "pedestrians"]
 
@@ -250,7 +251,7 @@ class Population:
     seed: TrafficSeed = 2022  # seed of the draws
     idm: Idm = Idm()
     towns: Towns | None = None  # the members are those of each town then
-    car_following: Literal["IDM", "EIDM", "Krauss", "ACC", "CACC"] = "IDM"  # SUMO's model, with the values of ``idm``
+    car_following: CarFollowing = "IDM"  # SUMO's model, with the values of ``idm``
     fitted: Many[
         FittedDriver
     ] = ()  # the members of each profile follow as these, in turn; () as ``idm`` and profiles say
@@ -497,6 +498,58 @@ SENSORS = {
     "occlusion": Sensor(occlusion=True),
     "corners": Sensor(occlusion=True, corners_m=1.5),
     "delay_0.2": Sensor(delay_s=0.2),
+}
+TRAINING_SENSORS = (  # of policies that shall cope with any sensor; those of tests in held-out worlds are others
+    PERFECT,
+    Sensor(noise_m=0.05),
+    Sensor(noise_m=0.15),
+    Sensor(noise_m=0.1, noise_time_s=0.5),
+    Sensor(dropouts_per_s=0.25, dropout_s=0.8),
+    Sensor(range_m=20.0),
+    Sensor(noise_m=0.05, occlusion=True),
+    Sensor(delay_s=0.1),
+    Sensor(delay_s=0.3),
+)
+
+
+@dataclass(frozen=True)
+class World:
+    """Drivers and sensors among which policies are trained, or tested unseen."""
+
+    title: str
+    population: str = "traits"  # a name in POPULATIONS
+    car_following: CarFollowing = "IDM"
+    tau_s: TauS | None = None  # time headway of all drivers; None: the population's
+    sensors: tuple[Sensor, ...] = (PERFECT,)  # of several, each has an equal share of the environments
+
+
+def _with_sensor(title: str, sensor: str) -> World:
+    return World(title, sensors=(SENSORS[sensor],))
+
+
+HELD_OUT_WORLDS = {  # never trained or tuned on
+    "held_out_towns": World("64 unseen towns", "held_out_towns"),
+    "headway_0.7": World("headway 0.7 s", tau_s=0.7),
+    "headway_1.5": World("headway 1.5 s", tau_s=1.5),
+    "headway_2.0": World("headway 2.0 s", tau_s=2.0),
+    "same_speed": World("no difference in speed", "same_speed"),
+    "same_gap": World("no difference in gap", "same_gap"),
+    "eidm": World("EIDM", car_following="EIDM"),
+    "krauss": World("Krauss", car_following="Krauss"),
+    "acc": World("ACC", car_following="ACC"),
+    "noise_0.1": _with_sensor("noise 0.1 m", "noisy_0.1"),
+    "noise_0.2": _with_sensor("noise 0.2 m", "noisy_0.2"),
+    "correlated_noise": _with_sensor("correlated noise", "correlated"),
+    "dropouts": _with_sensor("dropouts", "dropouts"),
+    "range_15": _with_sensor("range 15 m", "range_15"),
+    "occlusion": _with_sensor("occlusion", "occlusion"),
+    "delay_0.2": _with_sensor("delay 0.2 s", "delay_0.2"),
+}
+WORLDS = {
+    "old": World("the old world"),
+    "strangers": World("128 towns and nine sensors", "towns", sensors=TRAINING_SENSORS),
+    "towns": World("128 towns", "towns"),
+    **HELD_OUT_WORLDS,
 }
 
 

@@ -10,6 +10,7 @@ from tint_sumo.cli import main
 from tint_sumo.core.checkpoints import CHECKPOINT_FILE
 from tint_sumo.core.files import shipped
 from tint_sumo.methods.registry import METHODS, Learned
+from tint_sumo.policy.storage import read_policy_card
 
 
 def test_help_names_the_learned_methods(capsys: pytest.CaptureFixture[str]) -> None:
@@ -83,6 +84,26 @@ def test_policies_are_evaluated_with_other_sensors(tmp_path: Path, capsys: pytes
     assert "sensor.range: there is no such setting" in refuse(capsys, *argv, "--config", file)
     assert "--noise is 0.1 m, and 0.2 m in the sensor" in refuse(capsys, *argv, "--sensor", "noisy_0.2", "--noise", 0.1)
     assert run(capsys, *argv, "--sensor", "noisy_0.2", "--noise", 0.2)["sensor"] == "noisy_0.2"
+
+
+def test_policies_are_trained_and_tested_in_worlds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, small = tmp_path / "run", tmp_path / "small.yaml"
+    small.write_text("scene: {time_limit_s: 1.0}\nbudget: {n_envs: 9, n_steps: 16, n_minibatches: 2}\n")
+    train = ("policy", "train", "--method", "no_labels", "--config", small, "--steps", 1, "--out", out)
+    run(capsys, *train, "--world", "strangers")
+    card = read_policy_card(out / "policy")
+    assert len(card["sensors"]) == 9 and "sensor" not in card
+    assert card["scene_settings"]["population"]["towns"]["count"] == 128
+    tests = ("policy", "evaluate", "--model", out, "--episodes", 2)
+    late = run(capsys, *tests, "--world", "headway_2.0", "--p-conservative", 0.3)
+    assert (late["tau_s"], late["sensor"], late["p_conservative"]) == (2.0, "perfect", 0.3)
+    assert run(capsys, *tests, "--world", "delay_0.2")["sensor"] == "delay_0.2"
+    both = ("--world", "towns", "--sensor", "range_15")
+    assert "a world has a sensor; give --world or --sensor" in refuse(capsys, *tests, *both)
+    assert "a world has a sensor; give --world or --sensor" in refuse(capsys, *train, *both)
+    assert "are for training, and a test has one sensor" in refuse(capsys, *tests, "--world", "strangers")
+    assert "unknown world 'moon'" in refuse(capsys, *tests, "--world", "moon")
+    assert "unknown world 'moon'" in refuse(capsys, *train, "--world", "moon")
 
 
 def test_damaged_models(dataset: Path, trait_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,11 +24,12 @@ from tests.methods import runs
 from tests.scenes.networks import UserNetwork
 from tests.simulation.scenes import T
 from tint_sumo import traits
-from tint_sumo.config import SENSORS, Mix, PolicySettings, PpoSettings, TraitSettings
+from tint_sumo.config import PERFECT, SENSORS, TRAINING_SENSORS, Mix, PolicySettings, PpoSettings, TraitSettings
 from tint_sumo.core.checkpoints import CHECKPOINT_FILE, PICKLES
 from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import DivergedError, InputError
 from tint_sumo.core.progress import Progress, Report
+from tint_sumo.core.structures import plain
 from tint_sumo.envs import TaskSettings
 from tint_sumo.films.training_films import film_policy
 from tint_sumo.methods.evaluation import CASE_SEED, evaluate
@@ -452,6 +453,19 @@ def test_a_training_that_diverges_says_where_and_keeps_its_last_finite_policy(
     assert_same_training(tmp_path / "run", tmp_path / "at_a_stretch")
 
 
+def test_several_sensors_share_the_environments_of_a_training(tmp_path: Path, tiny: PpoSettings) -> None:
+    sensors = [PERFECT, SENSORS["noisy_0.2"]]
+    policy = train_policy("no_labels", Mix(0.4), 256, 0, tmp_path / "run", settings=tiny, sensors=sensors)
+    assert read_policy_card(policy.with_suffix(""))["sensors"] == [plain(sensor) for sensor in sensors]
+    assert load_policy(policy).sensor == PERFECT
+    train_policy("no_labels", Mix(0.4), 256, 0, tmp_path / "perfect", settings=tiny)
+    assert policy.read_bytes() != (tmp_path / "perfect" / "policy.safetensors").read_bytes()
+    with pytest.raises(InputError, match="another run"):
+        train_policy("no_labels", Mix(0.4), 256, 0, tmp_path / "run", settings=tiny, sensors=sensors[:1])
+    with pytest.raises(InputError, match="n_envs must be at least 9, an environment for each scene and sensor, not 4"):
+        train_policy("no_labels", Mix(0.4), 64, 0, tmp_path / "more", settings=tiny, sensors=TRAINING_SENSORS)
+
+
 def test_a_film_of_a_policy_that_has_diverged_says_at_which_step(
     tmp_path: Path, tiny: PpoSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -476,7 +490,7 @@ def test_a_film_of_a_policy_that_has_diverged_says_at_which_step(
 
 
 def test_a_training_with_another_sensor_is_another_run(tmp_path: Path, tiny: PpoSettings) -> None:
-    policy = train_policy("oracle", Mix(0.4), 64, 0, tmp_path, settings=tiny, sensor=SENSORS["range_15"])
+    policy = train_policy("oracle", Mix(0.4), 64, 0, tmp_path, settings=tiny, sensors=[SENSORS["range_15"]])
     assert read_policy_card(policy.with_suffix(""))["sensor"]["range_m"] == 15.0
     assert load_policy(tmp_path).task.sensor == SENSORS["range_15"]
     with pytest.raises(InputError, match=r"another run \(different: sensor\)"):

@@ -24,6 +24,7 @@ from tint_sumo.cli.values import (
     TestScene,
     TestSensor,
     TestTau,
+    WorldName,
     optional,
 )
 from tint_sumo.config import SENSORS, Decisions, Mix, NoiseM, Seed, Sensor, network_ppo
@@ -75,6 +76,7 @@ class TrainPolicy(NetworkCommand):
     budget: PpoBudgetValue = "full"
     """Size of the network, settings of PPO and number of decisions; full takes 5 to 8 minutes on a free core. In a SUMO
     configuration full has 8 environments, each a process, and 200,000 decisions."""
+    world: WorldName = None
     sensor: Annotated[SensorValue, _SENSOR] = "perfect"
     scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}, or all but t_intersection_street at once: all.")] = (
         "t_intersection"
@@ -87,13 +89,18 @@ class TrainPolicy(NetworkCommand):
 
     def run(self) -> Outcome:
         from tint_sumo.envs.episodes import find_sensor
+        from tint_sumo.envs.worlds import find_world, scene_in
         from tint_sumo.films.training_films import film_policy
         from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.training import train_policy
-        from tint_sumo.scenes import find_scenes
+        from tint_sumo.scenes import find_scene, find_scenes
 
         use_one_thread()
-        scene = self.scene_of(self.scene)
+        scene, sensors = self.scene_of(self.scene), [find_sensor(self.sensor)]
+        if self.world is not None:
+            require_one_sensor(None if self.sensor == TrainPolicy.sensor else self.sensor)
+            world = find_world(self.world)
+            scene, sensors = scene_in(world, find_scene(scene)), list(world.sensors)
         is_given = self.p_conservative != TrainPolicy.p_conservative
         first = find_scenes(scene)[0]
         has_mix = is_given or first.sumocfg is None
@@ -110,7 +117,7 @@ class TrainPolicy(NetworkCommand):
                 self.out,
                 settings=settings,
                 scene=scene,
-                sensor=find_sensor(self.sensor),
+                sensors=sensors,
                 traits=self.traits,
                 other_scene=self.other_scene,
                 with_zip=self.zip,
@@ -131,6 +138,7 @@ class EvaluatePolicy(NetworkCommand, SpreadCommand):
 
     model: PolicyName
     p_conservative: TestMix = None
+    world: WorldName = None
     scene: TestScene = None
     sensor: TestSensor = None
     noise: NoiseM = 0.0
@@ -151,7 +159,7 @@ class EvaluatePolicy(NetworkCommand, SpreadCommand):
 
         use_one_thread()
         contender = load_policy(self.model, scene=self.scene_of(self.scene), allow_pickle=self.allow_pickle)
-        task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau)
+        task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau, self.world)
         with self.workers_of(1) as workers:
             if isinstance(workers, int):
                 with one_job(f"evaluate {self.model}") as report:
@@ -240,16 +248,21 @@ def task_of(
     sensor: "str | Sensor | None",
     noise_m: float,
     tau_s: float | None,
+    world: str | None,
 ) -> "TaskSettings":
     """Return the settings of the environments that flags ask for; what is not given is as in the policy's training.
 
     Raises:
-        InputError: there are two noises.
+        InputError: there are two noises, or two sensors.
     """
     from tint_sumo.envs.episodes import find_sensor
+    from tint_sumo.envs.worlds import find_world, task_in
 
     mix = contender.p_conservative if p_conservative is None else Mix.parse(p_conservative)
     task = replace(contender.task, p_conservative=mix, tau_s=tau_s)
+    if world is not None:
+        require_one_sensor(sensor)
+        task = task_in(find_world(world), task)
     if sensor is not None:
         task = replace(task, sensor=find_sensor(sensor))
     if noise_m == 0.0:
@@ -257,6 +270,12 @@ def task_of(
     if task.sensor.noise_m not in (0.0, noise_m):
         raise InputError(f"`noise` is {noise_m:g} m, and {task.sensor.noise_m:g} m in the sensor; give it once")
     return replace(task, sensor=replace(task.sensor, noise_m=noise_m))
+
+
+def require_one_sensor(sensor: "str | Sensor | None") -> None:
+    """Raise InputError if a sensor is given beside a world, which has one."""
+    if sensor is not None:
+        raise InputError("a world has a sensor; give `world` or `sensor`")
 
 
 def content_of(task: "TaskSettings") -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Annotated
 from tint_sumo.cli.command import Outcome, use_one_thread
 from tint_sumo.cli.own_network import NetworkCommand
 from tint_sumo.cli.policy import content_of, task_of
-from tint_sumo.cli.values import PolicyName, TestMix, TestScene, TestSensor, TestTau
+from tint_sumo.cli.values import PolicyName, TestMix, TestScene, TestSensor, TestTau, WorldName
 from tint_sumo.config import NoiseM, Seed
 from tint_sumo.core.ranges import Range
 
@@ -24,6 +24,7 @@ class Render(NetworkCommand):
     """Number of the case; the same cases as in policy evaluate."""
     seed: Seed = 0
     """Number of the case set, 0 to 1000."""
+    world: WorldName = None
     scene: TestScene = None
     sensor: TestSensor = None
     noise: NoiseM = 0.0
@@ -41,7 +42,7 @@ class Render(NetworkCommand):
         require_film_file(self.out)
         use_one_thread()
         contender = load_policy(self.model, scene=self.scene_of(self.scene), allow_pickle=self.allow_pickle)
-        task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau)
+        task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau, self.world)
         with one_job(f"render {self.out}") as report:
             film = render_case(contender, self.case, self.out, case_set=self.seed, task=task, report=report)
         text = f"{film.outcome} after {film.time_s:.1f} s, {film.frames} frames: {self.out}"

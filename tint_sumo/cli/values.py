@@ -8,7 +8,7 @@ from tyro.conf import arg
 
 from tint_sumo import ENV_IDS
 from tint_sumo.cli.configuration import FromFile, name_flag, one_of
-from tint_sumo.config import POPULATIONS, SENSORS, Fraction, Perceivable, TauS
+from tint_sumo.config import POPULATIONS, SENSORS, WORLDS, Fraction, Perceivable, TauS
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import Many, Where, choose
 
@@ -133,6 +133,14 @@ TestScene = Annotated[
 TestSensor = Annotated[
     SensorValue,
     optional("NAME", f"Sensor that the ego perceives the others with: {', '.join(SENSORS)}.", "as in its training"),
+]
+WorldName = Annotated[
+    str | None,
+    optional(
+        "NAME",
+        f"World, which is a population of drivers and a sensor: {', '.join(WORLDS)}.",
+        "the scene's drivers, and the sensor",
+    ),
 ]
 TestTau = Annotated[
     TauS | None, optional("FLOAT", "Time headway of the other drivers, s.", "the scene's, 1 s in built-in scenes")

@@ -65,7 +65,7 @@ def train_policy(
     *,
     settings: PpoSettings,
     scene: str | AnyScene = T_INTERSECTION,
-    sensor: Sensor = PERFECT,
+    sensors: Sequence[Sensor] = (PERFECT,),
     traits: str | Path | None = None,
     other_scene: bool = False,
     with_zip: bool = False,
@@ -89,7 +89,7 @@ def train_policy(
         out: a new folder, or the one of this very run.
         settings: network and PPO; its ``total_steps`` is not used.
         scene: the scene it trains in, or ``"all"``.
-        sensor: with which the ego perceives the others.
+        sensors: with which the egos perceive the others; of several, each has an equal share of the environments.
         traits: trait model by name or path, for methods that infer traits; the shipped one if not given.
         other_scene: take a trait model that was trained in another scene, too.
         with_zip: write the policy as Stable-Baselines3's policy.zip, too.
@@ -117,6 +117,11 @@ def train_policy(
     if encoder is not None and not other_scene:
         require_scene(traits or str(learned.encoder), trained_in["scene"], trained_in["scene_digest"], "the policy")
     settings = learned.settings_of(settings)
+    if len(scenes) * len(sensors) > settings.n_envs:
+        raise InputError(
+            f"n_envs must be at least {len(scenes) * len(sensors)}, an environment for each scene and sensor, not "
+            f"{settings.n_envs}"
+        )
     if scenes[0].sumocfg and settings.n_envs > _MOST_SIMULATIONS:
         raise InputError(
             f"each environment in a SUMO configuration is a process; n_envs must be at most {_MOST_SIMULATIONS}, not "
@@ -129,7 +134,7 @@ def train_policy(
         "steps": steps,
         "seed": seed,
         **trained_in,
-        **({} if sensor == PERFECT else {"sensor": plain(sensor)}),
+        **_sensors_entry(sensors),
         "settings": asdict(settings),
         "traits": None if encoder is None else digest(encoder),
     }
@@ -144,7 +149,7 @@ def train_policy(
             if encoder is not None:
                 save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)).entries)
             card = _card(identity, encoder)
-            venv = training_venv(learned, encoder, p_conservative, settings, scenes, sensor)
+            venv = training_venv(learned, encoder, p_conservative, settings, scenes, sensors)
             try:
                 with preserved_random_state(), single_threaded():
                     model = _learn(venv, outcomes_in(scenes[0]), steps, seed, out, settings, card, film, report)
@@ -187,6 +192,13 @@ def _require_drivers(learned: Learned, p_conservative: Mix | None, scene: AnySce
         require_two_kinds(kinds, f"method {learned.name}", f"scene {scene.name}")
 
 
+def _sensors_entry(sensors: Sequence[Sensor]) -> dict[str, Any]:
+    """Return the card's entry about the sensors of a training."""
+    if len(sensors) > 1:
+        return {"sensors": [plain(sensor) for sensor in sensors]}
+    return {} if sensors[0] == PERFECT else {"sensor": plain(sensors[0])}
+
+
 def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | None:
     if learned.encoder is None:
         return None
@@ -201,7 +213,7 @@ def training_venv(
     p_conservative: Mix | None,
     settings: PpoSettings,
     scenes: Sequence[AnyScene],
-    sensor: Sensor = PERFECT,
+    sensors: Sequence[Sensor] = (PERFECT,),
 ) -> VecEnv:
     """Return environments with the traits that the method is trained with."""
     time_limit_s = min(settings.time_limit_s, *(scene.time_limit_s for scene in scenes))
@@ -209,7 +221,11 @@ def training_venv(
     return policy_venv(
         settings.n_envs,
         shown.make_source(encoder if shown.encoder else None),
-        [TaskSettings(scene, p_conservative, time_limit_s=time_limit_s, sensor=sensor) for scene in scenes],
+        [
+            TaskSettings(scene, p_conservative, time_limit_s=time_limit_s, sensor=sensor)
+            for scene in scenes
+            for sensor in sensors
+        ],
         action_repeat=settings.action_repeat,
         critic_sees_true_traits=learned.critic_sees_true_traits,
         monitored=True,

@@ -1,14 +1,16 @@
 """Windows as a sensor gives them."""
 
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tint_sumo.config import SENSORS, Mix, Sensor
+from tint_sumo.config import POPULATIONS, SENSORS, Mix, Sensor
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.windows import Windows
-from tint_sumo.envs import TaskSettings
+from tint_sumo.envs import SceneVectorEnv, TaskSettings
+from tint_sumo.scenes import Scene, paper_scene
 from tint_sumo.traits.perceived import perceived_windows
 
 TASK = TaskSettings(p_conservative=Mix(0.5))
@@ -40,6 +42,34 @@ def test_dropouts_make_shorter_tracks_and_noise_rougher_ones() -> None:
     full = rough.length == 20
     bend_m = np.diff(rough.states[full, :, 0], n=2, axis=1)
     assert bend_m.std() == pytest.approx(0.2 * np.sqrt(6.0), rel=0.1)
+
+
+def test_a_window_has_the_label_of_its_last_step() -> None:
+    """Attention lapses for seconds, so that one driver has windows of both labels."""
+    drivers = replace(paper_scene(), population=POPULATIONS["inattentive"])
+    windows, labels = perceived_windows(replace(TASK, scene=drivers, time_limit_s=10.0), 100, num_envs=4, seed=5)
+    of_driver = [set(labels[windows.driver == driver].tolist()) for driver in np.unique(windows.driver)]
+    assert {0, 1} in of_driver and {1} in of_driver
+    seen = record_labels(drivers)
+    for driver in np.unique(windows.driver):
+        mine = labels[windows.driver == driver]
+        shown = seen[int(driver)]
+        ends = np.minimum(np.arange(1, len(mine) + 1) * 20, len(shown)) - 1
+        np.testing.assert_array_equal(mine, np.array(shown)[ends])
+
+
+def record_labels(drivers: Scene) -> dict[int, list[int]]:
+    """The labels of each driver at every step at which it is seen, numbered as in windows."""
+    found: dict[int, list[int]] = {}
+    with closing(SceneVectorEnv(4, TaskSettings(drivers, TASK.p_conservative, time_limit_s=10.0))) as env:
+        env.reset(seed=5)
+        for _ in range(100):
+            rows = env.batch.rows
+            for index, slot in np.argwhere(rows["track"] >= 0).tolist():
+                number = index * 100_000 + int(rows["track"][index, slot])
+                found.setdefault(number, []).append(int(rows["traits"][index, slot]))
+            env.step(np.zeros(4, np.int64))
+    return found
 
 
 def test_windows_follow_from_the_seed() -> None:

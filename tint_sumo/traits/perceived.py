@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from tint_sumo.core.ranges import Range
-from tint_sumo.dataset.windows import Windows, cut_windows
+from tint_sumo.dataset.windows import Windows, cut_windows, window_rows
 from tint_sumo.envs import SceneVectorEnv, TaskSettings
 
 _WAIT = 0  # action
@@ -19,10 +19,11 @@ _TRACKS_PER_EPISODE = 100_000
 def perceived_windows(
     task: TaskSettings, steps: int, *, num_envs: int = 64, seed: int = 0
 ) -> tuple[Windows, NDArray[np.int64]]:
-    """Return windows (N,) of the tracks that a waiting ego perceives, and the labels (N,) of their drivers.
+    """Return windows (N,) of the tracks that a waiting ego perceives, and the labels (N,) of their drivers then.
 
     They come the same way as what a policy's trait model reads while it drives. A track ends where the sensor loses its
-    vehicle, which is another driver in the windows when it is seen again.
+    vehicle, which is another driver in the windows when it is seen again. Where labels change with time, a window has
+    that of its last step.
 
     Args:
         task: scene, drivers and sensor.
@@ -55,5 +56,5 @@ def perceived_windows(
     at = (when[order], at_env[order], slot[order])
     driver = driver[order]
     windows = cut_windows(driver, driver // _TRACKS_PER_EPISODE, position_m[at], gap_m[at])
-    first = np.searchsorted(driver, windows.driver)
-    return windows, traits[at][first].astype(np.int64)
+    first, length = window_rows(driver)
+    return windows, traits[at][first + length - 1].astype(np.int64)

@@ -176,7 +176,9 @@ def test_on_a_terminal_the_table_moves_and_leaves_a_line_for_each_job(
     seen = see(process, terminal)
     assert process.wait(PATIENCE_S) == 0
     os.close(terminal)
-    assert re.search(r"first +\S* *\S+ +33%", re.sub(r"\x1b\[[\d;?]*\w", "", seen)), "a job's row moves"
+    # On a busy machine not every step of every job is drawn.
+    drawn = re.sub(r"\x1b\[[\d;?]*\w", "", seen)
+    assert re.search(r"(?:first|second) +\S* *\S+ +(?:33|67)%", drawn), "a job's row moves"
     assert "0 of 2 jobs are done" in seen and "1 of 2 jobs are done" in seen
     assert len(re.findall(r"(?:first|second): written \(\d+ s\)", seen)) == 2
     assert seen.rindex(SHOW) > seen.rindex(HIDE)

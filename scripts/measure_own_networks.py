@@ -9,7 +9,6 @@ not named stay as they are.
 import argparse
 import csv
 import io
-import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 
 import sumo
 
+from tint_sumo.bench.networks import grid_config
 from tint_sumo.config import EgoController, PpoSettings, network_ppo
 from tint_sumo.core.files import write_text
 from tint_sumo.core.progress import Progress
@@ -24,15 +24,12 @@ from tint_sumo.methods.evaluation import REPORTED_SET, evaluate
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.training import train_policy
 from tint_sumo.scenes import SumocfgScene, from_sumocfg
-from tint_sumo.scenes.network import sumo_program
 
 RESULTS = Path(__file__).parents[1] / "data" / "results" / "own_networks.csv"
 SHIPPED = Path(sumo.SUMO_HOME) / "tools" / "game"
 CASES = 200
 RULES = ("always_go", "ttc", "sumo")
 OUTCOMES = ("success", "timeout", "collision", "red_light", "lost")
-_GRID = "--grid --grid.number 4 --grid.length 150 --grid.attach-length 150 -L 2 --default-junction-type traffic_light"
-_FLOW = '<flow id="{0}" from="{0}" to="{1}" begin="0" end="3600" period="exp(0.08)" departSpeed="max"/>'
 # A single environment needs no other process: on busy cores, processes wait for each other.
 _ALONE: dict[str, Any] = {"n_envs": 1, "n_steps": 256, "n_minibatches": 1, "n_epochs": 8, "learning_rate": 2e-3}
 _REPORT_EVERY = 5000  # decisions
@@ -82,18 +79,8 @@ def braunschweig(_: Path) -> Network:
 
 def grid(folder: Path) -> Network:
     """Return 4 by 4 crossings with lights, which the ego sees; it goes straight on, turns right, and is there."""
-    net = folder / "grid.net.xml"
-    subprocess.run([sumo_program("netgenerate"), *_GRID.split(), "-o", str(net)], check=True, capture_output=True)
-    ways = [(f"left{row}A{row}", f"D{row}right{row}") for row in range(4)]
-    ways += [(f"bottom{column}{letter}0", f"{letter}3top{column}") for column, letter in enumerate("ABCD")]
-    write_text(folder / "grid.rou.xml", f"<routes>{''.join(_FLOW.format(*way) for way in ways)}</routes>")
-    write_text(
-        folder / "grid.sumocfg",
-        '<configuration><net-file value="grid.net.xml"/><route-files value="grid.rou.xml"/><step-length value="0.1"/>'
-        "</configuration>",
-    )
     scene = from_sumocfg(
-        folder / "grid.sumocfg",
+        grid_config(folder, 0.08),
         ["bottom1B0", "B0B1", "B1C1"],
         20.0,
         330.0,

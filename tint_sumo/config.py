@@ -143,7 +143,7 @@ class Idm:
 
 @dataclass(frozen=True)
 class FittedDriver:
-    """How a recorded driver follows: parameters of a car-following model that were fitted together."""
+    """Parameters of a car-following model that were fitted together to the recording of a driver."""
 
     tau_s: TauS
     min_gap_m: DistanceM

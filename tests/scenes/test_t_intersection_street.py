@@ -23,7 +23,7 @@ REPLICAS = 40
 
 @pytest.fixture(scope="module")
 def driven() -> Iterator[dict[str, np.ndarray]]:
-    """What happens on many streets while egos wait for some time and then go."""
+    """Outcomes of episodes in many replicas of the street, whose egos wait for some time and then go."""
     simulation = SceneSimulation(REPLICAS, replace(STREET, traffic=replace(STREET.traffic, p_conservative=Mix(0.7))))
     with closing(simulation):
         for replica in range(REPLICAS):

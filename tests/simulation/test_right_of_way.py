@@ -1,4 +1,4 @@
-"""Who has priority over the ego at its next junction."""
+"""Right of way: whether the ego must yield at its next junction, and which vehicles have priority over it."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

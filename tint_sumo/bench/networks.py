@@ -14,6 +14,7 @@ import sumo
 
 from tint_sumo.bench.measuring import Turn, turns_apart
 from tint_sumo.config import EgoController
+from tint_sumo.core.files import write_text
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.scene_env import SceneEnv
 from tint_sumo.envs.vector import SceneVectorEnv
@@ -70,22 +71,34 @@ def _braunschweig() -> SumocfgScene:
     return _scene(_BRAUNSCHWEIG, ["-5.5", "5", "9", "6", "-6", "-9"], 200.0)
 
 
-def _grid(folder: Path) -> SumocfgScene:
+def grid_config(folder: Path, vehicles_per_s: float) -> Path:
+    """Write 4 by 4 crossings with traffic lights into a folder; return the SUMO configuration.
+
+    Args:
+        folder: of the files.
+        vehicles_per_s: mean rate of each of the eight flows, which go straight on.
+    """
     net = folder / "grid.net.xml"
     subprocess.run([sumo_program("netgenerate"), *_GRID.split(), "-o", str(net)], check=True, capture_output=True)
     ways = [(f"left{row}A{row}", f"D{row}right{row}") for row in range(4)]
     ways += [(f"bottom{column}{letter}0", f"{letter}3top{column}") for column, letter in enumerate("ABCD")]
     flows = "".join(
-        f'<flow id="{start}" from="{start}" to="{end}" begin="0" end="3600" period="exp(0.25)" departSpeed="max"/>'
+        f'<flow id="{start}" from="{start}" to="{end}" begin="0" end="3600" period="exp({vehicles_per_s:g})" '
+        'departSpeed="max"/>'
         for start, end in ways
     )
-    (folder / "grid.rou.xml").write_text(f"<routes>{flows}</routes>", encoding="utf-8")
-    (folder / "grid.sumocfg").write_text(
-        f'<configuration><net-file value="{net}"/><route-files value="grid.rou.xml"/><step-length value="0.1"/>'
+    write_text(folder / "grid.rou.xml", f"<routes>{flows}</routes>")
+    sumocfg = folder / "grid.sumocfg"
+    write_text(
+        sumocfg,
+        '<configuration><net-file value="grid.net.xml"/><route-files value="grid.rou.xml"/><step-length value="0.1"/>'
         "</configuration>",
-        encoding="utf-8",
     )
-    return _scene(folder / "grid.sumocfg", ["bottom1B0", "B0B1", "B1C1", "C1D1"], 450.0)
+    return sumocfg
+
+
+def _grid(folder: Path) -> SumocfgScene:
+    return _scene(grid_config(folder, 0.25), ["bottom1B0", "B0B1", "B1C1", "C1D1"], 450.0)
 
 
 def _scene(sumocfg: Path, route: list[str], goal_m: float) -> SumocfgScene:

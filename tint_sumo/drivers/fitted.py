@@ -76,7 +76,7 @@ class DriverFit:
 
 @dataclass(frozen=True)
 class PopulationFit:
-    """How drivers differ; see ``tint_sumo.drivers.population``."""
+    """Distribution of the drivers' parameters; see ``tint_sumo.drivers.population``."""
 
     mean: Fit  # with the error of the mean
     between: tuple[Numbers, ...]

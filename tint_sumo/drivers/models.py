@@ -128,15 +128,13 @@ _EPS = 0.001
 _STEPPING_S = 0.25  # IDM's attribute stepping: its speed is found in steps of about so long
 _DELTA = 4.0  # IDM's exponent
 _AMPLIFIER = 1.2  # of an emergency braking
-_EMERGENCY_MPS2 = 9.0
-_LEADER_MPS2 = 4.5
 
 
 @compiled
 def _bounded(speed: float, wanted: float, desired: float, accel: float, decel: float, step_s: float) -> float:
     """Return the next speed: the wanted one within what the vehicle's acceleration and braking allow."""
     planned = min(wanted, desired)
-    hardest = max(speed - _EMERGENCY_MPS2 * step_s, 0.0)  # or with decel, if that is more
+    hardest = max(speed - EMERGENCY_DECEL_MPS2 * step_s, 0.0)  # or with decel, if that is more
     least = min(max(speed - decel * step_s, 0.0), max(planned, hardest))
     return max(least, min(planned, speed + accel * step_s, desired))
 
@@ -164,7 +162,7 @@ def _drive_idm(
             change = accel * (1.0 - (new / desired) ** _DELTA - (wished / gap) ** 2)
             new = max(0.0, new + change * step_s / iterations)
             gap -= max(0.0, (new - ahead) * step_s / iterations)
-        speed_mps = _bounded(speed_mps, new, desired, accel, max(decel, min(_EMERGENCY_MPS2, 1.5)), step_s)
+        speed_mps = _bounded(speed_mps, new, desired, accel, max(decel, min(EMERGENCY_DECEL_MPS2, 1.5)), step_s)
         front_m += speed_mps * step_s
 
 
@@ -193,8 +191,8 @@ def _needed_decel(gap: float, speed: float, ahead: float, emergency: float) -> f
     """Return how hard a vehicle must brake so as not to touch its leader."""
     if gap <= 0.0:
         return emergency
-    steady = 0.5 * speed * speed / (gap + 0.5 * ahead * ahead / _LEADER_MPS2)
-    if steady <= _LEADER_MPS2:
+    steady = 0.5 * speed * speed / (gap + 0.5 * ahead * ahead / LEADER_DECEL_MPS2)
+    if steady <= LEADER_DECEL_MPS2:
         return steady
     return 0.5 * (speed * speed - ahead * ahead) / gap
 
@@ -211,11 +209,11 @@ def _drive_krauss(
     speeds_mps: Floats,
 ) -> None:
     desired, tau, min_gap, accel, decel = parameters
-    emergency = max(_EMERGENCY_MPS2, decel)
+    emergency = max(EMERGENCY_DECEL_MPS2, decel)
     for row in range(len(leader_rear_m)):
         fronts_m[row], speeds_mps[row] = front_m, speed_mps
         gap, ahead = leader_rear_m[row] - front_m - min_gap, leader_speed_mps[row]
-        braking_m = _brake_gap_m(ahead, max(decel, _LEADER_MPS2), step_s)
+        braking_m = _brake_gap_m(ahead, max(decel, LEADER_DECEL_MPS2), step_s)
         wanted = max(speed_mps - emergency * step_s, 0.0)
         if gap >= 0.0:
             wanted = _safe_stop_mps(gap + braking_m, decel, tau, step_s)

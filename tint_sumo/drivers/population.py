@@ -71,13 +71,13 @@ class Population:
 
     @property
     def any_pair(self) -> Estimate:
-        """What is known of a pair of which nothing is recorded."""
+        """Distribution of the parameters of a pair without a recording."""
         return Estimate(self.mean, self.total)
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a pair says about its parameters: a normal distribution by its precision."""
+    """Likelihood of a pair's parameters as a normal distribution, given by its precision."""
 
     mode: Floats  # (P,) with the prior
     precision: Floats  # (P, P)

@@ -1,4 +1,4 @@
-"""How the ego's sensor has the persons on foot around it in a SUMO configuration."""
+"""Persons on foot around the ego in a SUMO configuration, as its sensor perceives them."""
 
 import numpy as np
 

@@ -21,12 +21,12 @@ from tint_sumo.simulation import SumocfgSimulation
 
 _FARTHEST = 5.0  # bound of distances ahead: 100 m
 _TIME_SCALE_S, _LONGEST = 10.0, 10.0  # times are observed divided by the first, up to the second: 100 s
-_SIGNALS = ("ru", "yY", "G", "g", "s", "oO")  # SUMO's letters for the states that are told apart
+_SIGNALS = ("ru", "yY", "G", "g", "s", "oO")  # letters of SUMO's signal states, by entry of the observation
 _MOST_LANES = 64
 
 
 class Road(NamedTuple):
-    """What the values of keys come from."""
+    """Sources of the values of the observation's keys."""
 
     simulation: SumocfgSimulation
     source: Numbers  # (V,) slot of the simulation whose vehicle each slot of the observation shows, or negative

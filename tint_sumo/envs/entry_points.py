@@ -5,7 +5,7 @@ the entry point. So these are classes, and here alone keyword arguments become s
 ``TaskSettings``, whose fields are the only list of what can be set.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import fields
 from inspect import signature
 from typing import Any
@@ -26,7 +26,7 @@ class GymnasiumEnv(SceneEnv):
     """``SceneEnv`` as ``gymnasium.make`` makes it."""
 
     def __init__(self, render_mode: str | None = None, **task: Any) -> None:
-        super().__init__(TaskSettings(**_known(GymnasiumEnv, task)), render_mode)
+        super().__init__(TaskSettings(**known_arguments(GymnasiumEnv, task)), render_mode)
 
 
 class GymnasiumVectorEnv(SceneVectorEnv):
@@ -40,7 +40,7 @@ class GymnasiumVectorEnv(SceneVectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **task: Any,
     ) -> None:
-        task = _known(GymnasiumVectorEnv, task)
+        task = known_arguments(GymnasiumVectorEnv, task)
         scenes = task.get("scene")
         if isinstance(scenes, list | tuple):
             each = [TaskSettings(**{**task, "scene": scene}) for scene in scenes]
@@ -49,15 +49,24 @@ class GymnasiumVectorEnv(SceneVectorEnv):
             super().__init__(num_envs, TaskSettings(**task), render_mode, workers, autoreset_mode)
 
 
-def _known(entry_point: type, task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of ``TaskSettings`` among those of an entry point; ``position_noise_m`` makes a sensor.
+def known_arguments(
+    entry_point: type, task: Mapping[str, Any], more: Iterable[str] = (), without: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return the further arguments of an entry point; ``position_noise_m`` makes a sensor.
+
+    Args:
+        entry_point: class with named arguments.
+        task: the further arguments.
+        more: names of those that are none of ``TaskSettings``.
+        without: names of ``TaskSettings`` that this entry point does not have.
 
     Raises:
-        InputError: neither an entry point nor ``TaskSettings`` has an argument of some name, or the noise has no sense.
+        InputError: there is no argument of some name, or the noise has no sense.
     """
     arguments = signature(entry_point).parameters.values()
     named = [argument.name for argument in arguments if argument.kind is not argument.VAR_KEYWORD]
-    require_fields(task, dict.fromkeys([*named, *(field.name for field in fields(TaskSettings)), _NOISE]))
+    settings = [field.name for field in fields(TaskSettings) if field.name not in without]
+    require_fields(task, dict.fromkeys([*named, *settings, *more, _NOISE]))
     if _NOISE not in task:
         return dict(task)
     if "sensor" in task:

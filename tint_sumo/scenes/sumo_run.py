@@ -16,6 +16,7 @@ import numpy as np
 from tint_sumo.scenes.sumo_config import SumoConfig, first_reason, refused
 
 _SEED_BITS = 31
+_ADDITIONAL = "additional-files"
 _UP = "../" * 64  # from any folder to the root
 _CONTROLLED = {
     "random": "false",
@@ -41,15 +42,24 @@ class SumocfgRun:
     The configuration's output options are left out. Files that its additional files and devices write, wherever, go to
     a temporary folder: SUMO puts ``output-prefix`` before the last part of each path. ``close`` removes that folder,
     with all that has been put into it.
+
+    Args:
+        config: the configuration.
+        types_xml: vTypes that are added to those of the configuration.
     """
 
-    def __init__(self, config: SumoConfig) -> None:
+    def __init__(self, config: SumoConfig, types_xml: str = "") -> None:
         folder = Path(tempfile.mkdtemp(prefix="tint_sumo_"))
         self.close = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self.output = folder / "output"
         self.output.mkdir()
         prefix = {"output-prefix": f"{_UP}{self.output.resolve().relative_to('/')}/"}
         self._values = config.values(folder) | _CONTROLLED | prefix
+        if types_xml:
+            types = folder / "types.add.xml"
+            types.write_text(f"<additional>{types_xml}</additional>", encoding="utf-8")
+            files = [named for named in (self._values.get(_ADDITIONAL, ""), str(types)) if named]
+            self._values[_ADDITIONAL] = ",".join(files)
 
     def options(
         self, seed: int | Sequence[int], step_s: float | None = None, more: Mapping[str, str] | None = None

@@ -117,6 +117,11 @@ class SumocfgScene:
         return self.config.step_s
 
     @property
+    def added_types_xml(self) -> str:
+        """The vTypes that the configuration does not have."""
+        return ""
+
+    @property
     def digest(self) -> str:
         return self.config.digest
 

@@ -115,7 +115,7 @@ class SumocfgSimulation(Simulation):
         self.passed_m = self.stop_line_m = np.array([np.inf])  # no way is ever left behind, and none is waited at
         self.claims = np.zeros((replicas, 1), bool)
         with self._refusals:
-            self._run = SumocfgRun(scene.config)
+            self._run = SumocfgRun(scene.config, scene.added_types_xml)
             self.connection = connect(self._run.options(seed=0), backend)
         self.warm_starts = WarmStarts(scene, self.connection, self._run)
         self._kinds = Kinds(scene.config, scene.vtypes, self.connection)
@@ -159,7 +159,7 @@ class SumocfgSimulation(Simulation):
             self._look_as_far_as_needed()
             fastest_mps = self.connection.vehicle.getMaxSpeed(EGO)
             self._way = EgoWay(self.connection, self.scene.departure[0], fastest_mps * self._step_s)
-            seen = self.connection.vehicle.getContextSubscriptionResults(EGO)
+            seen = self._seen()
         if EGO not in seen:
             raise self._taken_at_start()
         sight = seen[EGO]
@@ -213,14 +213,19 @@ class SumocfgSimulation(Simulation):
                 if scene.ego_control == "sumo":
                     self._hand_over_ego()
                 else:
-                    vehicle.setSpeedMode(EGO, SPEED_MODE_OBEY_SETSPEED)
-                    vehicle.setLaneChangeMode(EGO, _ONLY_STRATEGIC_CHANGES)
-                    vehicle.setSpeed(EGO, 0.0)
+                    self._hold_ego()
                 return
         raise InputError(
             f"the ego found no room at its start ({scene.start_m:g} m) for {_ENTRY_PATIENCE_S:g} s: vehicles stand or "
             "enter there, or a vaporizer lets none in; choose another start_m or warm_up_s"
         )
+
+    def _hold_ego(self) -> None:
+        """Let the ego stand until it is given a speed."""
+        vehicle = self.connection.vehicle
+        vehicle.setSpeedMode(EGO, SPEED_MODE_OBEY_SETSPEED)
+        vehicle.setLaneChangeMode(EGO, _ONLY_STRATEGIC_CHANGES)
+        vehicle.setSpeed(EGO, 0.0)
 
     def _hand_over_ego(self) -> None:
         """Let SUMO's driver of a default passenger car drive the ego, which has entered as in all other episodes."""
@@ -251,13 +256,17 @@ class SumocfgSimulation(Simulation):
             return
         with self._refusals:
             moved_m = self._drive(desired_speed_mps) * self._step_s
-            self.connection.step()
+            self._simulate()
             fate = self._way.look(moved_m)
         if fate is Fate.DRIVES:
             self._look()
         else:
             self._end(fate)
         self.egos.ran_red[0] |= self.scene.red_light == "end" and self.perception.lights.passed_red > 0
+
+    def _simulate(self) -> None:
+        """Let SUMO do a step."""
+        self.connection.step()
 
     def _drive(self, desired_speed_mps: Floats) -> float:
         """Choose the ego's speed in this step, if SUMO does not; return it, or the highest that SUMO may choose."""
@@ -281,7 +290,7 @@ class SumocfgSimulation(Simulation):
         """Take over from SUMO where the ego and the vehicles in its sight are."""
         if self.connection.vehicletype.getIDCount() > self._known_vtypes:
             self._look_as_far_as_needed()  # from the next step on
-        seen = dict(self.connection.vehicle.getContextSubscriptionResults(EGO))
+        seen = self._seen()
         ego = seen.pop(EGO)
         self.egos.front_m[0] = self.scene.start_m + ego[constants.VAR_DISTANCE]
         self.egos.speed_mps[0] = ego[constants.VAR_SPEED]
@@ -291,6 +300,10 @@ class SumocfgSimulation(Simulation):
         self._follow(seen if seen.keys() <= self.slot.keys() else self._nearest(seen, ego[constants.VAR_POSITION3D]))
         self.perception.look(float(self.egos.front_m[0]), self.slot)
         self._look_around()
+
+    def _seen(self) -> dict[str, Sight]:
+        """Return the ego and what is around it, by their ids."""
+        return dict(self.connection.vehicle.getContextSubscriptionResults(EGO))
 
     def _look_around(self) -> None:
         super()._look_around()

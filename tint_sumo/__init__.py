@@ -18,14 +18,15 @@ ENV_IDS = {
     "on_ramp": "tint_sumo/OnRamp-v0",
 }
 SCENE_ENV_ID = "tint_sumo/Scene-v0"  # the environment of any scene, which is given as ``scene``
+REPLAY_ENV_ID = "tint_sumo/Replay-v0"  # an ego among recorded vehicles
 
 
-def _register(env_id: str, **scene: str) -> None:
+def _register(env_id: str, module: str = "envs.entry_points", prefix: str = "Gymnasium", **scene: str) -> None:
     if env_id not in registry:
         register(
             id=env_id,
-            entry_point="tint_sumo.envs.entry_points:GymnasiumEnv",
-            vector_entry_point="tint_sumo.envs.entry_points:GymnasiumVectorEnv",
+            entry_point=f"tint_sumo.{module}:{prefix}Env",
+            vector_entry_point=f"tint_sumo.{module}:{prefix}VectorEnv",
             kwargs=scene,
         )
 
@@ -33,3 +34,4 @@ def _register(env_id: str, **scene: str) -> None:
 for _scene, _env_id in ENV_IDS.items():
     _register(_env_id, scene=_scene)
 _register(SCENE_ENV_ID)
+_register(REPLAY_ENV_ID, "replay.env", "Replay")

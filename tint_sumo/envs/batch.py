@@ -114,7 +114,7 @@ class LocalBatch:
         if rng is None or seed is not None:
             rng, _ = seeding.np_random(seed)
             self._rngs[index], before = rng, None
-        self._start(index, EpisodeStart.after(before, rng, self._settings.episodes_per_town))
+        self._start(index, self._settings.next_start(before, rng))
 
     def _start(self, index: int, start: EpisodeStart) -> None:
         self._starts[index] = start
@@ -164,7 +164,7 @@ class LocalBatch:
                     rng, _ = seeding.np_random(0)
                     rng.bit_generator.state = snapshot.began
                     self._rngs[index] = rng
-                    self._start(index, EpisodeStart.drawn(rng, self._settings.episodes_per_town, snapshot.number))
+                    self._start(index, EpisodeStart.drawn(rng, self._settings.row, snapshot.number))
             if left:
                 actions = [snapshot.actions[-left] if left <= len(snapshot.actions) else 0 for snapshot in snapshots]
                 self._actions.append(np.array(actions, _ACTION))

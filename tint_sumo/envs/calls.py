@@ -129,6 +129,21 @@ def checked_options(options: Any, known: tuple[str, ...] = ()) -> Mapping[str, A
     return options or {}
 
 
+def checked_case(options: Any, cases: int) -> int | None:
+    """Return the case that a reset's options choose among so many; None without a choice.
+
+    Raises:
+        InputError: there is no such option or case.
+    """
+    case = checked_options(options, ("case",) if cases else ()).get("case")
+    if case is None:
+        return None
+    number = _integer(case)
+    if number is None or not 0 <= number < cases:
+        raise InputError(f"case must be an integer from 0 to {cases - 1}, not {shown(case)}")
+    return number
+
+
 def checked_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:
     """Return which environments to reset, (N,); all where the mask is None.
 

@@ -36,6 +36,7 @@ from tint_sumo.envs.perceived import (
     perceived_spaces,
 )
 from tint_sumo.envs.rendering import render_scene
+from tint_sumo.envs.replayed import observe_recording, replayed_fields, replayed_infos
 from tint_sumo.envs.rows import (
     BOUND,
     COLLISION,
@@ -61,7 +62,8 @@ from tint_sumo.envs.sensing import Sensing
 from tint_sumo.scenes import AnyScene, Scene, SumocfgScene, find_scene, paper_scene, require_built_in
 from tint_sumo.scenes.buildings import corner_buildings
 from tint_sumo.scenes.geometry import NO_VEHICLE, Floats
-from tint_sumo.simulation import SumocfgSimulation, make_simulation
+from tint_sumo.scenes.replay import ReplayScene
+from tint_sumo.simulation import ReplaySimulation, SumocfgSimulation, make_simulation
 from tint_sumo.simulation.timing import StepPart, does
 
 PEDESTRIAN = "pedestrian"  # in place of the trait of somebody on foot
@@ -143,10 +145,21 @@ class TaskSettings:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
-    def episodes_per_town(self) -> int:
-        """Number of episodes in a row that are in one town."""
+    def cases(self) -> int:
+        """Number of a recording's cases, among which each episode draws one; 0 in scenes that are no recording."""
+        return len(self.scene.cases) if isinstance(self.scene, ReplayScene) else 0
+
+    @property
+    def row(self) -> int:
+        """Number of seeds in a row that belong together: of the episodes in a town, or of a recording's cases."""
         scene = self.scene
-        return scene.population.episodes_per_town if isinstance(scene, Scene) else 1
+        return scene.population.episodes_per_town if isinstance(scene, Scene) else max(1, self.cases)
+
+    def next_start(
+        self, before: "EpisodeStart | None", rng: np.random.Generator, case: int | None = None
+    ) -> "EpisodeStart":
+        """Return the start of the episode that follows another one; ``case`` is the number of a recording's, if any."""
+        return EpisodeStart.drawn(rng, self.row, case) if self.cases else EpisodeStart.after(before, rng, self.row)
 
     @cached_property
     def contents(self) -> Contents:
@@ -161,12 +174,14 @@ class TaskSettings:
             slot_infos,
             REWARD_TERMS if red_light == "ignore" else (*REWARD_TERMS, RED_LIGHT_TERM),
             (COST,) if red_light == "cost" else (),
+            replayed_infos(self.scene),
         )
 
     @property
     def row_type(self) -> np.dtype[np.void]:
         """Type of an environment's record."""
-        return row_type(self.played.max_vehicles, perceived_fields(self.scene))
+        more = [*perceived_fields(self.scene), *replayed_fields(self.scene)]
+        return row_type(self.played.max_vehicles, more)
 
     @property
     def observation_space(self) -> spaces.Dict:
@@ -222,7 +237,7 @@ def episode_seed(rng: np.random.Generator, row: int = 1) -> int:
 
     Args:
         rng: the generator.
-        row: number of episodes in a row that are in one town; the seed is a multiple of it, and the others follow.
+        row: number of seeds in a row that belong together; the seed is a multiple of it, and the others follow.
     """
     return int(rng.integers(_SEED_LIMIT)) // row * row
 
@@ -233,13 +248,15 @@ class EpisodeStart:
 
     began: dict[str, Any]  # state of the environment's generator before it drew the seed of the row's first episode
     seed: int
-    number: int = 0  # of the episode in its row, all of which are in one town
+    number: int = 0  # of the episode in its row: in its town, or of its case in a recording
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, row: int, number: int = 0) -> "EpisodeStart":
-        """Return the episode of this number in the next row of the generator."""
+    def drawn(cls, rng: np.random.Generator, row: int, number: int | None = 0) -> "EpisodeStart":
+        """Return the episode of this number in the next row of the generator; of a number that it draws, if None."""
         began = dict(rng.bit_generator.state)
-        return cls(began, episode_seed(rng, row) + number, number)
+        seed = episode_seed(rng)
+        number = seed % row if number is None else number
+        return cls(began, seed // row * row + number, number)
 
     @classmethod
     def after(cls, before: "EpisodeStart | None", rng: np.random.Generator, row: int) -> "EpisodeStart":
@@ -304,6 +321,8 @@ class Episodes:
     def begin(self, index: int, seed: int) -> None:
         """Start a new episode in an environment."""
         self.simulation.reset(index, seed)
+        if isinstance(self.simulation, ReplaySimulation):  # its cases have goals and time limits of their own
+            self._rules = TaskRules.of(self.simulation.scene, REWARD_PRESETS[self.settings.reward])
         self._parked.discard(index)
         self._clear(index)
         self.sensing(index).begin(index, seed)
@@ -394,6 +413,8 @@ class Episodes:
         )
         if self._road is not None:
             observe_road(self._road, rows)
+        if isinstance(self.simulation, ReplaySimulation):
+            observe_recording(self.simulation, rows)
         if self.settings.tracks:
             self._observe_tracks(sensing, envs)
         if self._reveals:
@@ -429,4 +450,7 @@ class Episodes:
         if event is None or self.rows["outcome"][index] != COLLISION:
             return {}
         trait = PEDESTRIAN if event.trait == NO_VEHICLE else self.simulation.scene.traits[event.trait]
-        return {"trait": trait, "route": event.route, "slot": event.slot, "ego_m": (event.ego_x_m, event.ego_y_m)}
+        found = {"trait": trait, "route": event.route, "slot": event.slot, "ego_m": (event.ego_x_m, event.ego_y_m)}
+        if isinstance(self.simulation, ReplaySimulation):
+            found["replayed"] = self.simulation.is_replayed(event.slot)
+        return found

@@ -41,6 +41,7 @@ class Contents(NamedTuple):
     slot_infos: tuple[str, ...] = ("traits",)  # infos with a value for each vehicle slot
     terms: tuple[str, ...] = REWARD_TERMS
     step_infos: tuple[str, ...] = ()  # further infos after a step
+    infos: tuple[str, ...] = ()  # further infos after a step or a reset
 
 
 def row_type(max_vehicles: int, more: Sequence[tuple[str, Any, tuple[int, ...]]] = ()) -> np.dtype[np.void]:
@@ -113,6 +114,7 @@ def start_info(fields: Mapping[str, Any], contents: Contents) -> dict[str, Any]:
         **slots,
         "outcome": outcome_name(fields["outcome"]),
         "time_s": fields["time_s"],
+        **{name: fields[name] for name in contents.infos},
         **town_info(fields["town"]),
     }
 

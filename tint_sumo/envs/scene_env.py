@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Snapshot, checked_snapshots
-from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_options, checked_seed
+from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_case, checked_seed
 from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings, action_space
 from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
 from tint_sumo.envs.rows import Observation, fields_of, observation_of, start_info, step_info
@@ -212,16 +212,16 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start a new episode; there are no options.
+        """Start a new episode; among recorded vehicles, the option ``case`` chooses the case by its number.
 
         Raises:
-            InputError: the seed is none, or options are given.
+            InputError: the seed is none, or there is no such option or case.
         """
         self._calls.require_open()
-        checked_options(options)
+        case = checked_case(options, self._settings.cases)
         super().reset(seed=checked_seed(seed))
         before = self._start if seed is None else None
-        self._play(EpisodeStart.after(before, self.np_random, self._settings.episodes_per_town), ())
+        self._play(self._settings.next_start(before, self.np_random, case), ())
         self._show()
         return self._shown()
 
@@ -289,7 +289,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._calls.require_open()
         (snapshot,) = checked_snapshots([snapshot], [self._settings.fingerprint])
         self.np_random.bit_generator.state = snapshot.began
-        row = self._settings.episodes_per_town
+        row = self._settings.row
         self._play(EpisodeStart.drawn(self.np_random, row, snapshot.number), snapshot.actions)
         self._show()
         return self._shown()

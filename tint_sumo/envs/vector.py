@@ -226,6 +226,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         """Return the infos of the environments in a mask, or of all; 0 or None elsewhere, as gymnasium has it."""
         infos = {**{key: rows[key] for key in self.contents.slot_infos}, "outcome": outcome_names(rows["outcome"])}
         infos["time_s"] = rows["time_s"]
+        infos |= {name: rows[name] for name in self.contents.infos}
         shown = np.ones(self.num_envs, bool) if mask is None else mask.copy()
         if not shown.all():
             for values in infos.values():

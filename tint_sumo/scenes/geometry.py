@@ -315,3 +315,95 @@ def between(first: Any, last: Any, share: float, box: Any) -> None:
     else:
         box.heading_x, box.heading_y = last.heading_x, last.heading_y
     box.length_m, box.width_m = last.length_m, last.width_m
+
+
+@compiled
+def box_on_way(way: Boxes, driven_m: Floats, along_m: float, box: Any) -> None:
+    """Write the box that has come so far along a way; beyond its end it goes straight on.
+
+    Args:
+        way: (P,) boxes one after the other.
+        driven_m: (P,) how far along the way they are; never falling.
+        along_m: wanted.
+        box: written.
+    """
+    last, along_m = len(way) - 1, max(along_m, driven_m[0])
+    index = min(max(int(np.searchsorted(driven_m, along_m, side="right")) - 1, 0), last)
+    if index < last:
+        between(way[index], way[index + 1], (along_m - driven_m[index]) / (driven_m[index + 1] - driven_m[index]), box)
+        return
+    between(way[last], way[last], 1.0, box)
+    beyond_m = along_m - driven_m[last]
+    box.x_m += beyond_m * box.heading_x
+    box.y_m += beyond_m * box.heading_y
+
+
+_SAME_DIRECTION = 0.5  # least cosine of the angle between two headings
+
+
+@compiled
+def find_meetings(
+    way: Boxes,
+    driven_m: Floats,
+    along_m: float,
+    speed_mps: float,
+    step: int,
+    steps: int,
+    every: int,
+    step_s: float,
+    tracks: Numbers,
+    first_step: Numbers,
+    first_row: Numbers,
+    rows: Numbers,
+    boxes: Boxes,
+    near_m: float,
+    meets: Bools,
+) -> None:
+    """Find the recorded vehicles that would come near to a vehicle that drives on along its way at its speed.
+
+    Vehicles that it would only come up to from behind do not count.
+
+    Args:
+        way, driven_m, along_m: as in ``box_on_way``, of the vehicle.
+        speed_mps: its speed.
+        step: the present one.
+        steps, every: to look ahead, all so many.
+        step_s: length of a step.
+        tracks: (M,) numbers of recorded vehicles, among N.
+        first_step, first_row, rows: (N,) of their tracks.
+        boxes: (R,) of all rows.
+        near_m: distance between boxes.
+        meets: (M,) set to true where a vehicle would come so near.
+    """
+    own = way[:1].copy()
+    behind = np.zeros(len(tracks), np.bool_)
+    for ahead in range(0, steps + 1, every):
+        box_on_way(way, driven_m, along_m + speed_mps * ahead * step_s, own[0])
+        box = own[0]
+        for index in range(len(tracks)):
+            track = tracks[index]
+            row = step + ahead - first_step[track]
+            if meets[index] or behind[index] or row < 0 or row >= rows[track]:
+                continue
+            other = boxes[first_row[track] + row]
+            reach_m = near_m + (math.hypot(box.length_m, box.width_m) + math.hypot(other.length_m, other.width_m)) / 2
+            dx_m, dy_m = box.x_m - other.x_m, box.y_m - other.y_m
+            if abs(dx_m) < reach_m and abs(dy_m) < reach_m and clearance_m(box, other) <= near_m:
+                turned = box.heading_x * other.heading_x + box.heading_y * other.heading_y
+                ahead_m = dx_m * other.heading_x + dy_m * other.heading_y
+                behind[index] = turned > _SAME_DIRECTION and ahead_m < -other.length_m / 2
+                meets[index] = not behind[index]
+
+
+@compiled
+def find_overlaps(boxes: Boxes, overlaps: Bools) -> bool:
+    """Find boxes (M,) that overlap; write them in ``overlaps`` (M, M), each pair once, and return whether any do."""
+    any_do = False
+    for first in range(len(boxes)):
+        for second in range(first + 1, len(boxes)):
+            a, b = boxes[first], boxes[second]
+            reach_m = (math.hypot(a.length_m, a.width_m) + math.hypot(b.length_m, b.width_m)) / 2
+            near = abs(a.x_m - b.x_m) < reach_m and abs(a.y_m - b.y_m) < reach_m
+            overlaps[first, second] = near and clearance_m(a, b) == 0.0
+            any_do = any_do or overlaps[first, second]
+    return any_do

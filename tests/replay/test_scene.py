@@ -1,0 +1,97 @@
+"""Scenes from a network and tracks: what they take of a recording, and what they refuse."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.replay.recordings import LOWER_Y_M, UPPER_Y_M, Driven, built, recording
+from tint_sumo.core.errors import InputError
+from tint_sumo.replay import EgoOnEdges, from_tracks
+
+WEST = Driven("west", 90.0, LOWER_Y_M, -10.0)
+
+
+def test_rows_are_interpolated_to_the_steps_of_the_scene(street: Path) -> None:
+    scene = from_tracks(street, recording([replace(WEST, step_s=0.25)]))
+    (one,) = scene.recordings
+    assert one.steps == 150
+    np.testing.assert_allclose(one.box["x_m"], 90.0 - np.arange(151) * 1.0)
+    np.testing.assert_allclose(one.driven_m, np.arange(151) * 1.0)
+    assert one.routes == (("lower_in.0", "lower_out.0"),)
+    assert one.on_road.all()
+
+
+def test_a_vehicle_is_not_there_while_it_was_lost(street: Path) -> None:
+    parts = [replace(WEST, last_s=2.0).rows(), replace(WEST, x_m=40.0, first_s=5.0).rows()]
+    (one,) = from_tracks(street, built([*parts, Driven("east", -90.0, UPPER_Y_M, 10.0).rows()])).recordings
+    assert one.vehicles == ("east", "west", "west")
+    assert one.first_step.tolist() == [0, 0, 50]
+
+
+def test_routes_go_on_where_vehicles_turn(street: Path) -> None:
+    """A vehicle from the south is on the stem, on both junctions, and on the upper lane then."""
+    way = np.concatenate([np.stack([np.zeros(20), np.linspace(-15.0, 0.0, 20)], axis=1), _quarter_circle()])
+    way = np.concatenate([way, np.stack([np.linspace(7.0, 60.0, 60), np.full(60, UPPER_Y_M)], axis=1)])
+    heading = np.arctan2(*np.gradient(way, axis=0).T[::-1])
+    shape = replace(WEST, name="turns", last_s=(len(way) - 1) * 0.1).rows()
+    shape["x_m"], shape["y_m"], shape["heading_rad"] = way[:, 0], way[:, 1], heading
+    scene = from_tracks(street, built([shape]))
+    (one,) = scene.recordings
+    assert one.routes == (("stem.0", "mid.0", "upper_out.0"),)
+    assert one.on_road.all()
+    (case,) = scene.cases
+    assert case.start_m == pytest.approx(20.0 - 15.0 + 2.5, abs=0.1)
+    assert case.goal_m - case.start_m == pytest.approx(np.hypot(*np.diff(way, axis=0).T).sum(), abs=1.5)
+
+
+def _quarter_circle() -> NDArray[np.float64]:
+    angle = np.linspace(0.1, np.pi / 2, 12)
+    return np.stack([6.0 - 6.0 * np.cos(angle), 6.0 * np.sin(angle)], axis=1)
+
+
+def test_persons_on_foot_are_no_cars(street: Path) -> None:
+    walker = Driven("walker", 20.0, UPPER_Y_M, 1.2, size_m=(0.5, 0.5), vehicle_class="pedestrian")
+    scene = from_tracks(street, recording([WEST, walker]))
+    assert scene.vtypes == ("car", "pedestrian")
+    assert [scene.recordings[0].vehicles[case.track] for case in scene.cases] == ["west"]
+    with pytest.raises(InputError, match="the ego cannot take over vehicle walker, which is no car"):
+        from_tracks(street, recording([WEST, walker]), "walker")
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "ego", "message"),
+    [
+        (
+            [replace(WEST, x_m=5000.0)],
+            None,
+            "no vehicle of street.csv is on a lane of the network: .* give",
+        ),
+        ([WEST], "east", "no recorded vehicle is called 'east'; choose one of west"),
+        ([WEST], 7, "ego must be names of recorded vehicles"),
+        ([replace(WEST, last_s=0.5)], None, "recording street of street.csv lasts 0.5 s; give one of at least 1 s"),
+        ([replace(WEST, speed_mps=-0.1)], None, "the ego cannot take over vehicle west, which drives less than 10 m"),
+        ([WEST], EgoOnEdges(("stem.0", "upper_in.0"), 5.0, 20.0), "no way for passenger cars leads from edge"),
+        ([WEST], EgoOnEdges(("stem.0", "mid.0"), 5.0, 200.0), "must lie on its route"),
+        ([replace(WEST, speed_mps=-0.1, x_m=65.0)], EgoOnEdges(("lower_in.0",), 40.0, 90.0), "no room at its start"),
+    ],
+)
+def test_bad_input_is_one_clear_line(street: Path, vehicles: list[Driven], ego: object, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        from_tracks(street, recording(vehicles), ego)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+def test_files_and_names_that_do_not_exist_are_refused(street: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no file"):
+        from_tracks(tmp_path / "no.net.xml", recording([WEST]))
+    with pytest.raises(InputError, match="no file"):
+        from_tracks(street, tmp_path / "no.csv")
+    with pytest.raises(InputError, match="drivers must be the folder of a fit"):
+        from_tracks(street, recording([WEST]), drivers=3)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="yields names none of the recorded vehicles"):
+        from_tracks(street, recording([WEST]), yields={"nobody": True})
+    with pytest.raises(InputError, match="release_s"):
+        from_tracks(street, recording([WEST]), release_s=-1.0)

@@ -1,0 +1,101 @@
+"""A scene from a SUMO network and recorded tracks."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from tint_sumo.config import STEP_S, EgoControl, EgoController, Perceivable, RedLight
+from tint_sumo.core.errors import InputError
+from tint_sumo.replay.cases import Ego, find_cases
+from tint_sumo.replay.drivers import AnyDrivers, attributes_of, find_drivers, types_xml
+from tint_sumo.replay.matching import Lanes
+from tint_sumo.replay.recordings import read_recordings, vehicle_classes
+from tint_sumo.scenes.replay import Recording, ReplayCase, ReplayScene
+from tint_sumo.scenes.sumo_config import SumoConfig
+from tint_sumo.scenes.sumo_run import require_loads
+from tint_sumo.scenes.sumocfg import SumocfgScene, read_net
+from tint_sumo.tracks.reading import read_tracks
+from tint_sumo.tracks.schema import Tracks
+
+_SIGHT_S = 5.0  # the ego sees as far as it drives in this time
+
+
+def from_tracks(
+    net: str | Path,
+    tracks: str | Path | Tracks,
+    ego: Ego = None,
+    *,
+    reactive: bool = ReplayScene.reactive,
+    drivers: AnyDrivers = None,
+    yields: Mapping[str, bool] | None = None,
+    track_format: str | None = None,
+    release_s: float = ReplayScene.release_s,
+    release_m: float = ReplayScene.release_m,
+    step_s: float = STEP_S,
+    max_vehicles: int = SumocfgScene.max_vehicles,
+    sight_m: float | None = None,
+    controller: EgoController | None = None,
+    ego_control: EgoControl = SumocfgScene.ego_control,
+    perceives: Sequence[Perceivable] = SumocfgScene.perceives,
+    red_light: RedLight = SumocfgScene.red_light,
+    red_light_penalty: float = SumocfgScene.red_light_penalty,
+) -> ReplayScene:
+    """Return a scene of a network with recorded vehicles; ``tint_sumo.replay.ReplayEnv`` describes the arguments.
+
+    Raises:
+        InputError: files are missing or damaged, the tracks do not lie on the network, there is no such vehicle, or
+            the ego has no way.
+    """
+    network = read_net(Path(net))
+    recorded = tracks if isinstance(tracks, Tracks) else read_tracks(Path(tracks), track_format)
+    lanes, labels, who = Lanes(network), vehicle_classes(recorded), find_drivers(drivers)
+    recordings = read_recordings(recorded, lanes, step_s, labels, yields or {})
+    recordings = tuple(
+        replace(one, attributes=attributes_of(who, one, np.array([lanes.limit_mps(route) for route in one.routes])))
+        for one in recordings
+    )
+    cases = find_cases(ego, recordings, lanes, step_s, labels)
+    options = (("net-file", str(Path(net).absolute())), ("step-length", f"{step_s:g}"), ("time-to-teleport", "-1"))
+    config = SumoConfig(Path(net).absolute(), options, ())
+    require_loads(config)
+    top_mps = max(lanes.limit_mps(case.route) for case in cases)
+    driven = controller or EgoController((0.0, top_mps / 2, top_mps))
+    if yields and not any(name in recording.vehicles for recording in recordings for name in yields):
+        raise InputError(f"yields names none of the recorded vehicles, but {next(iter(yields))!r}; use their names")
+    return ReplayScene(
+        name=recorded.file.name.partition(".")[0],
+        config=config,
+        vtypes=labels,
+        **ReplayScene.task_of(cases[0]),
+        max_vehicles=max_vehicles,
+        sight_m=max(SumocfgScene.sight_m, _SIGHT_S * driven.desired_speeds_mps[-1]) if sight_m is None else sight_m,
+        warm_up_s=0.0,
+        controller=driven,
+        ego_control=ego_control,
+        perceives=tuple(perceives),
+        red_light=red_light,
+        red_light_penalty=red_light_penalty,
+        recordings=recordings,
+        cases=cases,
+        recorded_digest=_digest(recordings, cases),
+        types_xml=types_xml(labels, who),
+        reactive=reactive,
+        release_s=release_s,
+        release_m=release_m,
+        longest_way_m=max(case.goal_m - case.start_m for case in cases),
+    )
+
+
+def _digest(recordings: Sequence[Recording], cases: Sequence[ReplayCase]) -> str:
+    """Return a checksum of all on which episodes depend, but for the network."""
+    whole = hashlib.sha256()
+    for one in recordings:
+        for array in (one.first_step, one.rows, one.box, one.speed_mps, one.on_road):
+            whole.update(np.ascontiguousarray(array).tobytes())
+        whole.update(repr((one.name, one.labels, one.routes, one.attributes, one.yields)).encode())
+    for case in cases:
+        whole.update(repr((case.recording, case.track, case.step, case.route, case.start_m, case.goal_m)).encode())
+    return whole.hexdigest()[:16]

@@ -7,6 +7,7 @@ from tests.drivers.conftest import KnownFit
 from tests.drivers.recordings import population, simulated_pair
 from tint_sumo.drivers.fitting import autocorrelation, fit_pair, gap_errors_m, gap_rmse_m, sensitivities
 from tint_sumo.drivers.models import MODELS
+from tint_sumo.drivers.pairs import Pair
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -53,3 +54,13 @@ def test_autocorrelation_is_that_of_the_process() -> None:
     correlation, deviation_m = autocorrelation(list(errors_m))
     assert correlation == pytest.approx(0.9, abs=0.01)
     assert deviation_m == pytest.approx(2.0 / np.sqrt(1.0 - 0.81), rel=0.05)
+
+
+def test_an_exact_recording_that_says_little_has_a_sound_covariance() -> None:
+    """Behind a leader at a constant speed the model is exact, and some parameters do not matter."""
+    truth = np.log([10.0, 1.2, 2.0, 1.8, 2.5]) + 0.2 * np.random.default_rng(5).standard_normal(5)
+    leader_mps = np.full(60, 6.0)
+    rear_m = 8.0 + np.cumsum(leader_mps) * 0.1
+    front_m, speed_mps = MODELS["IDM"].follow(rear_m, leader_mps, 0.0, 6.0, truth, 0.1)
+    pair = Pair("1", "1", "leader", 0.0, 0.1, rear_m, leader_mps, front_m, speed_mps)
+    assert np.linalg.eigvalsh(fit_pair(MODELS["IDM"], pair).covariance).min() > 0.0

@@ -23,6 +23,7 @@ _FAR_M = 500.0  # errors count no more than this, so that one start gone astray 
 _STEP = 1e-4  # of a parameter's logarithm, in derivatives
 _INSIDE = 1e-6  # a start lies so far within the bounds
 _FASTER = 1.1  # desired speed at a start, at least, times the highest recorded speed
+_LEAST_VARIANCE = 1e-10  # of a logarithm: 1e-5 of a parameter
 _MOST_CORRELATED = 0.9999
 _NORMAL_95 = 1.959964  # 97.5 % quantile of the normal distribution
 
@@ -119,8 +120,10 @@ def _covariance(model: CarFollowing, pair: Pair, best: Floats) -> Floats:
     least = np.diag(12.0 / (model.high - model.low) ** 2)  # of a uniform distribution
     weight = max(deviation_m**2, 1e-12)
     solved = np.linalg.inv(slopes.T @ slopes + weight * least)
-    covariance: Floats = solved @ (spread + weight**2 * least) @ solved
-    return covariance
+    covariance = solved @ (spread + weight**2 * least) @ solved
+    # Where the model is exact, as in recordings of simulations, rounding can make the smallest variances negative.
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
+    return np.asarray((vectors * np.maximum(values, _LEAST_VARIANCE)) @ vectors.T)
 
 
 def _noise(errors_m: Floats, slopes: Floats) -> tuple[float, float]:

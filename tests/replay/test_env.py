@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 from tests.replay.recordings import LOWER_Y_M, STEM, UPPER_Y_M, Driven, built, recording
 from tint_sumo import REPLAY_ENV_ID
-from tint_sumo.config import Idm
+from tint_sumo.config import FittedDriver
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, TaskSettings
 from tint_sumo.replay import EgoOnEdges, ReplayEnv, from_tracks
@@ -132,7 +132,7 @@ def test_a_released_vehicle_brakes_as_its_model_does(street: Path) -> None:
     leader, behind = Driven("ego", 20.0, UPPER_Y_M, 9.0), Driven("behind", -15.0, UPPER_Y_M, 9.0)
     at_m = {}
     for tau_s in (0.8, 2.5):
-        with made(street, recording([leader, behind]), ego="ego", drivers=Idm(tau_s=tau_s)) as env:
+        with made(street, recording([leader, behind]), ego="ego", drivers=FittedDriver(tau_s, 2.0, 2.0, 3.0)) as env:
             env.reset(seed=0)
             for _ in range(100):
                 action = STOP if env.simulation.egos.speed_mps[0] > 4.0 else SLOW

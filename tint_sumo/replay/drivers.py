@@ -6,7 +6,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from tint_sumo.config import Idm
+from tint_sumo.config import FittedDriver
 from tint_sumo.core.errors import InputError, shown
 from tint_sumo.drivers.fitted import Fitted, read_fitted
 from tint_sumo.drivers.models import CarFollowing, Floats
@@ -14,26 +14,26 @@ from tint_sumo.scenes.replay import Recording
 
 _MODEL = "carFollowModel"
 
-AnyDrivers = Idm | Fitted | str | Path | None  # what users write
+AnyDrivers = FittedDriver | Fitted | str | Path | None  # what users write
 
 
-def find_drivers(drivers: AnyDrivers) -> Fitted | Idm | None:
+def find_drivers(drivers: AnyDrivers) -> Fitted | FittedDriver | None:
     """Return the drivers that a user means; a path is that of a fit.
 
     Raises:
         InputError: they are none, or there is no such fit.
     """
-    if drivers is None or isinstance(drivers, Fitted | Idm):
+    if drivers is None or isinstance(drivers, Fitted | FittedDriver):
         return drivers
     if not isinstance(drivers, str | Path):
         raise InputError(
-            f"drivers must be the folder of a fit (tint-sumo drivers fit), Idm(...) or None, not {shown(drivers)}"
+            f"drivers must be the folder of a fit (tint-sumo drivers fit), a FittedDriver or None, not {shown(drivers)}"
         )
     return read_fitted(Path(drivers))
 
 
 def attributes_of(
-    drivers: Fitted | Idm | None, recording: Recording, limit_mps: Floats
+    drivers: Fitted | FittedDriver | None, recording: Recording, limit_mps: Floats
 ) -> tuple[Mapping[str, float], ...]:
     """Return the attributes of the vType of each recorded vehicle, beside those of its label.
 
@@ -75,14 +75,14 @@ def _fixed(model: CarFollowing) -> dict[str, str]:
     return {**dict(model.attributes), "speedDev": "0"}
 
 
-def types_xml(labels: Iterable[str], drivers: Fitted | Idm | None) -> str:
+def types_xml(labels: Iterable[str], drivers: Fitted | FittedDriver | None) -> str:
     """Return a vType for each label."""
     attributes = _shared(drivers)
     text = " ".join(f"{name}={quoteattr(value)}" for name, value in attributes.items())
     return "".join(f"<vType id={quoteattr(label)} {text}/>" for label in labels)
 
 
-def _shared(drivers: Fitted | Idm | None) -> dict[str, str]:
+def _shared(drivers: Fitted | FittedDriver | None) -> dict[str, str]:
     """Return the attributes that all vTypes have."""
     if drivers is None:
         return {}
@@ -90,10 +90,9 @@ def _shared(drivers: Fitted | Idm | None) -> dict[str, str]:
         return {_MODEL: drivers.model, **_fixed(drivers.car_following)}
     return {
         _MODEL: "IDM",
+        "tau": f"{drivers.tau_s:g}",
+        "minGap": f"{drivers.min_gap_m:g}",
         "accel": f"{drivers.accel_mps2:g}",
         "decel": f"{drivers.decel_mps2:g}",
-        "emergencyDecel": f"{drivers.emergency_decel_mps2:g}",
-        "tau": f"{drivers.tau_s:g}",
-        "delta": f"{drivers.delta:g}",
         "speedDev": "0",
     }

@@ -83,8 +83,8 @@ class ReplayEnv(SceneEnv):
       every_s=5.0, speed_mps=0.0)`` for a way of your own; default: any car that drives 10 m or more.
     * `reactive`: whether vehicles are released; default True.
     * `drivers`: folder of a fit (``tint-sumo drivers fit``) of this recording: each released vehicle drives as it was
-      fitted, those without a fit as the median driver. ``tint_sumo.config.Idm(...)``: all drive with these numbers.
-      Default: SUMO's default drivers.
+      fitted, those without a fit as the median driver. A ``tint_sumo.config.FittedDriver``: all drive with its
+      parameters of the Intelligent Driver Model. Default: SUMO's default drivers.
     * `yields`: for names of recorded vehicles, whether they yield to the ego, such as traits that were inferred of
       them; default: all do.
     * `release_s`, `release_m`: 4 s and 0.5 m; see above.

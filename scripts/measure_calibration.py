@@ -6,19 +6,21 @@ python scripts/measure_calibration.py [FOLDER]
 
 import csv
 import io
+import math
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tint_sumo.core.files import write_text
-from tint_sumo.drivers.check import check
-from tint_sumo.drivers.fitted import fit_drivers
+from tint_sumo.drivers.check import Check, check
+from tint_sumo.drivers.fitted import Fitted, fit_drivers
 from tint_sumo.drivers.fitting import Estimate, fit_pair, gap_rmse_m
 from tint_sumo.drivers.models import MODELS
 from tint_sumo.drivers.pairs import Pair, read_pairs
@@ -31,6 +33,7 @@ RESULTS = ROOT / "data" / "results"
 RECORDINGS = ROOT.parent / "shared" / "real" / "car_following"
 LONG_S = 15.0
 RESAMPLES = 10_000
+_MEDIAN_SQUARE = 0.4549  # of a standard normal variable: outliers of jerky recordings count for little
 
 
 @dataclass(frozen=True)
@@ -91,19 +94,58 @@ def predictions(pairs: Sequence[Pair], fits: Mapping[str, Estimate]) -> Iterator
             yield Row("posterior less, mean", name, "m", *bootstrap(drivers, difference_m, mean=True), len(drivers))
 
 
-def traffic(pairs: Sequence[Pair]) -> Iterator[Row]:
+def traffic(pairs: Sequence[Pair], model: str) -> Iterator[Row]:
     """Fit all pairs, and compare the traffic of the fitted drivers with the recorded one."""
     with tempfile.TemporaryDirectory() as folder:
         began_s = time.process_time()
-        fitted = fit_drivers(pairs, MODELS["IDM"], Path(folder) / "fit")
-        yield Row("time", "fit of all pairs", "s", time.process_time() - began_s, np.nan, np.nan, len(pairs))
-    found = check(fitted, pairs, repeats=5, seed=0)
+        fitted = fit_drivers(pairs, MODELS[model], Path(folder) / "fit")
+        yield Row(f"time {model}", "fit of all pairs", "s", time.process_time() - began_s, np.nan, np.nan, len(pairs))
+    yield from distances(model, check(fitted, pairs, repeats=5, seed=0))
+    if model == "EIDM":
+        sigma, persistence_s = driving_errors(fitted, pairs)
+        yield Row("errors EIDM", "sigmaerror", "1", sigma, np.nan, np.nan, len(pairs))
+        yield Row("errors EIDM", "tPersDrive", "s", persistence_s, np.nan, np.nan, len(pairs))
+        errors = {"sigmaerror": f"{sigma:.4g}", "tPersDrive": f"{persistence_s:.4g}"}
+        yield from distances("EIDM with errors", check(fitted, pairs, repeats=5, seed=0, attributes=errors))
+
+
+def distances(model: str, found: Check) -> Iterator[Row]:
     for one in found.distances:
         numbers = (one.distance.value, one.distance.low, one.distance.high)
-        yield Row("distance", f"{one.quantity}, {one.drivers}", "", *numbers, len(pairs))
+        yield Row(f"distance {model}", f"{one.quantity}, {one.drivers}", "", *numbers, found.pairs)
         for other, ratio in one.ratios.items():
             numbers = (ratio.value, ratio.low, ratio.high)
-            yield Row("ratio", f"{one.quantity}, {one.drivers}, {other}", "1", *numbers, len(pairs))
+            yield Row(f"ratio {model}", f"{one.quantity}, {one.drivers}, {other}", "1", *numbers, found.pairs)
+
+
+def driving_errors(fitted: Fitted, pairs: Sequence[Pair]) -> tuple[float, float]:
+    """Estimate EIDM's ``sigmaerror`` and ``tPersDrive`` from what the model errs in a second.
+
+    Each pair is driven anew from every recorded second on, with its fitted parameters. The error of the speed after a
+    second is the mean of EIDM's error of driving in it, which has ``sigmaerror`` times the acceleration parameter as
+    its standard deviation, and whose correlation falls by a factor of e in ``tPersDrive``.
+    """
+    model, fits = fitted.car_following, {one.name: one.fit.estimate.log_parameters for one in fitted.pairs}
+    accel = [parameter.name for parameter in model.parameters].index("accel_mps2")
+    every = round(1.0 / fitted.step_s)
+    squares, products, before = [], [], []
+    for pair in pairs:
+        z, errors = fits[pair.name], []
+        for row in range(every, pair.rows - every, every):
+            part = slice(row, row + every + 1)
+            _, speed_mps = model.follow(
+                pair.leader_rear_m[part],
+                pair.leader_speed_mps[part],
+                pair.front_m[row],
+                pair.speed_mps[row],
+                z,
+                pair.step_s,
+            )
+            errors.append((pair.speed_mps[row + every] - speed_mps[-1]) / np.exp(z[accel]))
+        squares += [error**2 for error in errors]
+        products += [error * after for error, after in pairwise(errors)]
+        before += [error**2 for error in errors[:-1]]
+    return math.sqrt(np.median(squares) / _MEDIAN_SQUARE), -1.0 / math.log(sum(products) / sum(before))
 
 
 def measure(folder: Path) -> Iterator[Row]:
@@ -115,7 +157,8 @@ def measure(folder: Path) -> Iterator[Row]:
         yield from rows
         if model == "IDM":
             yield from predictions(long, fits)
-    yield from traffic(pairs)
+    for model in ("IDM", "EIDM"):
+        yield from traffic(pairs, model)
 
 
 def main(folder: Path) -> None:

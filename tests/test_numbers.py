@@ -215,7 +215,7 @@ def test_the_page_on_calibration_has_the_measured_numbers() -> None:
         return f"{value:.{decimals}f} [{low:.{decimals}f}, {high:.{decimals}f}]"
 
     page = DOCS / "explanation" / "calibration.md"
-    fits, predictions, distances = (table.strip().split("\n")[2:] for table in _tables(page))
+    fits, predictions, distances, of_eidm = (table.strip().split("\n")[2:] for table in _tables(page))
     for line, model in zip(fits, MODELS, strict=True):
         own, default = (shown(f"gap error {model}", name) for name in ("fitted to the pair itself", "SUMO's defaults"))
         assert line == f"| {model} | {own} m | {default} m |"
@@ -223,9 +223,19 @@ def test_the_page_on_calibration_has_the_measured_numbers() -> None:
         cells = f"{shown('prediction', name, 1)} | {shown('posterior less', name, 1)}"
         assert line.split(" | ", 1)[1] == f"{cells} |"
     for line, (quantity, unit) in zip(distances, QUANTITIES.items(), strict=True):
-        cells = [shown("distance", f"{quantity}, {drivers}") for drivers in (*FITTED, *OTHERS)]
+        cells = [shown("distance IDM", f"{quantity}, {drivers}") for drivers in (*FITTED, *OTHERS)]
         assert line == f"| {quantity}, {unit} | {' | '.join(cells)} |"
-    assert f"takes {measured.loc[('time', 'fit of all pairs'), 'value']:.0f} s on one core" in _prose(str(page))
+    for line, (quantity, unit) in zip(of_eidm, QUANTITIES.items(), strict=True):
+        cells = [
+            shown(f"distance {model}", f"{quantity}, {drivers}")
+            for model in ("EIDM", "EIDM with errors")
+            for drivers in FITTED
+        ]
+        assert line == f"| {quantity}, {unit} | {' | '.join(cells)} |"
+    prose = _prose(str(page))
+    assert f"takes {measured.loc[('time IDM', 'fit of all pairs'), 'value']:.0f} s on one core" in prose
+    sigma, fading_s = (measured.loc[("errors EIDM", name), "value"] for name in ("sigmaerror", "tPersDrive"))
+    assert f"({sigma:.2f} and {fading_s:.2f} s;" in prose
 
 
 def test_the_table_of_own_networks_is_that_of_the_results() -> None:

@@ -32,7 +32,7 @@ def test_fitted_drivers_are_nearer_to_the_recording_than_sumo_s_own(checked: Che
 
 def test_the_same_seed_gives_the_same_numbers_and_another_one_others(known: KnownFit) -> None:
     pairs = known.pairs[:2]
-    first, again, other = (check(known.fitted, pairs, 1, seed) for seed in (3, 3, 4))
+    first, again, other = (check(known.fitted, pairs, 1, seed) for seed in (0, 0, 1))
     assert asdict(first) == asdict(again) != asdict(other)
 
 

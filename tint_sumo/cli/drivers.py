@@ -37,8 +37,8 @@ class FitDrivers(Command):
     """File of tracks, or folder with such files: leader-follower CSV, or any other format that tracks inspect reads."""
     out: Path
     """Folder for the fit."""
-    model: Literal["IDM", "Krauss"] = "IDM"
-    """SUMO's car-following model; Krauss without its random dawdling."""
+    model: Literal["IDM", "EIDM", "Krauss"] = "IDM"
+    """SUMO's car-following model; Krauss without its random dawdling, EIDM without its random errors."""
     format: TrackFormatName = None
     min_duration: _Duration = 1.0
     """Pairs of a leader and a follower that last less long are left out, s."""

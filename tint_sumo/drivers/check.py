@@ -97,6 +97,7 @@ def check(
     seed: int,
     speed_limit_mps: float | None = None,
     report: Report = silent,
+    attributes: Mapping[str, str] | None = None,
 ) -> Check:
     """Let SUMO drive in place of recorded followers, and compare.
 
@@ -108,15 +109,18 @@ def check(
         speed_limit_mps: of the recorded road; if not given, the speed that 5 % of the recorded moments exceed. SUMO's
             own drivers go by it.
         report: of the pairs done.
+        attributes: further ones of the fitted drivers' vTypes, such as errors of their driving.
     """
     limit_mps = speed_limit_mps or float(np.quantile(np.concatenate([pair.speed_mps for pair in pairs]), 0.95))
     one = fitted.population.population
     known = {driver.name: next_pair(one, driver.fit.estimate) for driver in fitted.drivers}
     ids = [f"{index}" for index in range(len(pairs) * repeats)]
-    sources = {POPULATION: (drawn_types(fitted, pairs, [one.any_pair] * len(pairs), repeats, seed, limit_mps), ids)}
+    sources = {
+        POPULATION: (drawn_types(fitted, pairs, [one.any_pair] * len(pairs), repeats, seed, limit_mps, attributes), ids)
+    }
     if all(pair.driver in known for pair in pairs):
         own = [known[pair.driver] for pair in pairs]
-        sources[SAME] = (drawn_types(fitted, pairs, own, repeats, seed, limit_mps), ids)
+        sources[SAME] = (drawn_types(fitted, pairs, own, repeats, seed, limit_mps, attributes), ids)
     sources[DEFAULT] = ("", ["DEFAULT_VEHTYPE"] * len(ids))
     sources[TOOL] = (_by_tool(seed), ["vehDist"] * len(ids))
     repeated = [pair for pair in pairs for _ in range(repeats)]
@@ -133,7 +137,13 @@ def check(
 
 
 def drawn_types(
-    fitted: Fitted, pairs: Sequence[Pair], known: Sequence[Estimate], repeats: int, seed: int, speed_limit_mps: float
+    fitted: Fitted,
+    pairs: Sequence[Pair],
+    known: Sequence[Estimate],
+    repeats: int,
+    seed: int,
+    speed_limit_mps: float,
+    attributes: Mapping[str, str] | None = None,
 ) -> str:
     """Return vTypes 0, 1, ... for each pair and repeat, drawn from what is known of the pair.
 
@@ -145,7 +155,7 @@ def drawn_types(
         drawn = draws(model, estimate, _DRAWN * repeats, seed + index)
         fast_first = np.argsort(np.exp(drawn[:, speed]) < pair.speed_mps[0], kind="stable")[:repeats]
         types += [
-            vtype_xml(f"{index * repeats + repeat}", model.vtype(drawn[row], speed_limit_mps))
+            vtype_xml(f"{index * repeats + repeat}", {**model.vtype(drawn[row], speed_limit_mps), **(attributes or {})})
             for repeat, row in enumerate(fast_first)
         ]
     return "".join(types)
@@ -161,7 +171,8 @@ def _by_tool(seed: int) -> str:
     with tempfile.TemporaryDirectory() as name:
         config, out = Path(name) / "config.txt", Path(name) / "types.add.xml"
         write_text(config, _TOOL_CONFIG)
-        command = [sys.executable, str(tool), str(config), "-o", str(out), "-s", str(_DRIVERS), "--seed", str(seed)]
+        numbers = ["-s", str(_DRIVERS), "--seed", str(seed + 1)]  # the tool takes 0 for no seed
+        command = [sys.executable, str(tool), str(config), "-o", str(out), *numbers]
         result = subprocess.run(command, capture_output=True, text=True, check=False)
         if result.returncode != 0:
             raise OSError(f"{tool} failed: {result.stderr.strip()}")

@@ -1,7 +1,7 @@
 """SUMO's car-following models: one follower behind a leader that moves as recorded, step by step as SUMO drives it.
 
 The steps are those of SUMO 1.28 with its default Euler update, on a lane whose speed limit is above all speeds. Tests
-compare them with SUMO. Randomness is left out: Krauss has ``sigma="0"``.
+compare them with SUMO. Randomness is left out: Krauss has ``sigma="0"``, and EIDM no errors of perception and driving.
 
 Source of the facts: https://github.com/eclipse-sumo/sumo, src/microsim/cfmodels.
 """
@@ -225,7 +225,203 @@ def _drive_krauss(
         front_m += speed_mps * step_s
 
 
+# SUMO's defaults of EIDM's further parameters, which are not fitted.
+_REACTION_S = 0.5  # tReaction
+_STARTING_S = 1.2  # taccmax: until a vehicle that starts has its full acceleration
+_STEEPNESS, _SHIFT = 2.0, 0.7  # mFlatness and mBegin of its start
+_JERK_MPS3 = 3.0  # jerkmax: by how much acceleration rises
+_JUMP_MPS2 = 1.0  # epsilonacc: drivers react at once if they want to brake so much harder
+_COOLNESS = 0.99  # ccoolness: how far drivers trust that their leaders do not brake all at once
+# Constants of EIDM's source.
+_MARGIN_M = 0.05  # of the wished gap
+_TOLERANCE_M = 0.25  # by which the minimum gap may be missed
+_FREE_M = 500.0  # gap on a free road
+_FAR = 1.5  # wished gaps from which on a leader's acceleration counts for less
+_CREEPING_MPS = 0.01  # least speed of a leader in the formula of coolness
+_HALTING_MPS = 0.1  # vehicles that are slower stand
+_CLUTCH_MPS = 0.5  # slower ones may start
+_SLOW_MPS = 3.0  # slower ones that brake react at once
+_STANDING_S = 2.0  # until a start counts as one
+_RESTART_S = 4.0  # between two starts
+_LONG_S = 86400.0
+
+
+@compiled
+def _improved_idm(speed: float, gap: float, wished: float, desired: float, accel: float, decel: float) -> float:
+    """Return the acceleration of Treiber and Kesting's improved IDM."""
+    if speed <= desired:
+        free = accel * (1.0 - (speed / desired) ** _DELTA)
+        if wished >= gap:
+            return accel * (1.0 - (wished / gap) ** 2)
+        return 0.0 if free <= 0.0 else free * (1.0 - math.pow(wished / gap, 2.0 * accel / free))
+    free = -decel * (1.0 - math.pow(desired / speed, accel * _DELTA / decel))
+    return free + accel * (1.0 - (wished / gap) ** 2) if wished >= gap else free
+
+
+@compiled
+def _cool(change: float, speed: float, ahead: float, gap: float, leader_accel: float, decel: float) -> float:
+    """Return an acceleration that brakes less where the leader's present acceleration allows it."""
+    if ahead * (speed - ahead) <= -2.0 * gap * leader_accel:
+        steady = speed * speed * leader_accel / (ahead * ahead - 2.0 * gap * leader_accel)
+    else:
+        steady = leader_accel - max(speed - ahead, 0.0) ** 2 / (2.0 * gap)
+    if change >= steady:
+        return change
+    return (1.0 - _COOLNESS) * change + _COOLNESS * (steady + decel * math.tanh((change - steady) / decel))
+
+
+@compiled
+def _started(
+    speed: float, new: float, began_s: float, now_s: float, may_begin: bool, step_s: float
+) -> tuple[float, float]:
+    """Return the next speed of a vehicle that starts, and when it began to."""
+    iterations = max(1, int(step_s / _STEPPING_S + 0.5))
+    reached = speed
+    for index in range(iterations):
+        at_s = now_s - step_s * (iterations - index - 1.0) / iterations
+        if may_begin and began_s + _RESTART_S - _EPS < at_s:
+            began_s = at_s
+        share = 1.0
+        if began_s + _STARTING_S + _EPS > at_s:
+            share = (math.tanh(((at_s - began_s) * 2.0 / _STARTING_S - _SHIFT) * _STEEPNESS) + 1.0) / 2.0
+        reached += (new - speed) / iterations * share
+    return reached, began_s
+
+
+@compiled
+def _wished(speed: float, ahead: float, tau: float, min_gap: float, braking: float) -> float:
+    """Return the gap that a driver wishes."""
+    return max(0.0, speed * tau + speed * (speed - ahead) / braking) + min_gap + _MARGIN_M
+
+
+@compiled
+def _eidm_plan(
+    parameters: Floats,
+    memory: Floats,
+    since: int,
+    speed_mps: float,
+    gap: float,
+    ahead_mps: float,
+    leader_accel_mps2: float,
+    began_s: float,
+    now_s: float,
+    step_s: float,
+) -> tuple[float, float, float, float]:
+    """Return what a driver plans behind one leader: next speed, accelerations with and without reaction time, leader's.
+
+    Args:
+        parameters: (5,) of the driver.
+        memory: gap, speed, leader's speed, acceleration and leader's acceleration when the driver last looked.
+        since: steps ago.
+        speed_mps, gap, ahead_mps, leader_accel_mps2: at present.
+        began_s: when the vehicle last started to drive.
+        now_s: present time.
+        step_s: step length.
+    """
+    desired, tau, min_gap, accel, decel = parameters
+    iterations = max(1, int(step_s / _STEPPING_S + 0.5))
+    braking = 2.0 * math.sqrt(accel * decel)
+    new, wanted, would, leader_accel = speed_mps, 0.0, 0.0, 0.0
+    for index in range(iterations):
+        left_s = step_s * (iterations - index - 1.0) / iterations
+        speed, ahead, seen = new, ahead_mps, gap
+        if since > 0:
+            ago_s = since * step_s - left_s
+            speed, ahead = max(memory[1] + memory[3] * ago_s, 0.0), max(memory[2] + memory[4] * ago_s, 0.0)
+            seen = memory[0] - (memory[1] + speed - memory[2] - ahead) / 2.0 * ago_s
+        wished = _wished(speed, ahead, tau, min_gap, braking)
+        if seen < min_gap + (step_s * 10.0 + 1.0) * _MARGIN_M and speed < _SLOW_MPS:
+            wished = max(wished, seen * math.sqrt(1.0 + 2.0 * _MARGIN_M / accel))
+        change = _improved_idm(speed, seen, wished, desired, accel, decel)
+        wanted = max(change, -speed / step_s)
+        would = _improved_idm(new, gap, _wished(new, ahead_mps, tau, min_gap, braking), desired, accel, decel)
+        would = max(would, -new / step_s)
+        leader_accel = _EPS
+        if ahead >= _CREEPING_MPS:
+            leader_accel = min(leader_accel_mps2, accel) * min(1.0, _FAR * wished / seen)
+        if began_s + _STARTING_S + _EPS < now_s - left_s and speed_mps > _HALTING_MPS:
+            change = _cool(change, speed, max(ahead, _CREEPING_MPS), seen, leader_accel, decel)
+        new = max(0.0, new + change * step_s / iterations)
+        gap = max(_EPS, gap - max(0.0, (new - ahead_mps) * step_s / iterations))
+    return new, wanted, would, leader_accel
+
+
+@compiled
+def _drive_eidm(
+    leader_rear_m: Floats,
+    leader_speed_mps: Floats,
+    front_m: float,
+    speed_mps: float,
+    parameters: Floats,
+    step_s: float,
+    fronts_m: Floats,
+    speeds_mps: Floats,
+) -> None:
+    """Drive as SUMO's EIDM (Salles, Kaufmann and Reuss 2020), with a reaction time, limited jerk and soft starts."""
+    desired, _, min_gap, accel, decel = parameters
+    emergency = max(EMERGENCY_DECEL_MPS2, decel)
+    tolerated = max(_EPS, min_gap - _TOLERANCE_M)
+    memory, since = np.zeros(5), 0
+    began_s, now_s, waiting_s, moving_s = -_LONG_S, step_s, 0.0, _LONG_S
+    before = 0.0  # acceleration in the step before
+    for row in range(len(leader_rear_m)):
+        fronts_m[row], speeds_mps[row] = front_m, speed_mps
+        ahead = leader_speed_mps[row]
+        ahead_accel = (ahead - leader_speed_mps[row - 1]) / step_s if row > 0 else 0.0
+        gap = max(_EPS, leader_rear_m[row] - front_m - min_gap + tolerated)
+        fastest = min(speed_mps + accel * step_s, desired)
+        new, wanted, would, leader_accel = _eidm_plan(
+            parameters, memory, since, speed_mps, gap, ahead, ahead_accel, began_s, now_s, step_s
+        )
+        # SUMO also plans for a free road, behind a leader that is 500 m ahead and as fast as this driver wants to be.
+        free, free_wanted, free_would, free_accel = _eidm_plan(
+            parameters, memory, since, speed_mps, _FREE_M + tolerated, desired, ahead_accel, began_s, now_s, step_s
+        )
+        real = (min(new, fastest) - speed_mps) / step_s
+        is_free = wanted > free_wanted - _EPS
+        if is_free:
+            gap, ahead, leader_accel, wanted = _FREE_M + tolerated, desired, free_accel, free_wanted
+            real = min(real, (min(free, fastest) - speed_mps) / step_s)
+            new = min(new, free)
+        would = min(would, free_would)
+        if since == 0:
+            memory[:3] = gap, speed_mps, ahead
+
+        planned = min(fastest, new)
+        hardest = max(speed_mps - emergency * step_s, 0.0)
+        least = min(max(speed_mps - decel * step_s, 0.0), max(planned, hardest))
+        after = max(least, planned)
+        if after > speed_mps > 2.0 * _CLUTCH_MPS and began_s + _STARTING_S + _EPS < now_s:
+            rise = _JERK_MPS3 * step_s
+            rise = before + (2.0 * rise if rise + before < 0.0 else rise)
+            after = max(min(after, speed_mps + rise * step_s), 0.0)
+        waits = planned <= _HALTING_MPS * step_s and waiting_s > _STANDING_S
+        moving_s = 0.0 if waits and planned - speed_mps <= accel / 2.0 * step_s else moving_s + step_s
+        if moving_s > 0.0 and since * step_s - moving_s > -_EPS:
+            after = 0.0
+        if after > speed_mps:
+            may_begin = speed_mps < _CLUTCH_MPS and since == 0 and before < min(accel / 4.0, 0.2)
+            after, began_s = _started(speed_mps, after, began_s, now_s, may_begin, step_s)
+
+        if since == 0:
+            memory[3], memory[4] = real, leader_accel
+            last_wanted = would = wanted
+        since = 0 if since >= _REACTION_S / step_s - 1.0 - _EPS else since + 1
+        slows = speed_mps < _SLOW_MPS and after < speed_mps
+        if would - last_wanted < -_JUMP_MPS2 or would < -emergency or slows:
+            since = 0
+        before = (after - speed_mps) / step_s
+        waiting_s = waiting_s + step_s if after <= _HALTING_MPS and before <= accel / 2.0 else 0.0
+        speed_mps = after
+        front_m += speed_mps * step_s
+        now_s += step_s
+
+
 MODELS: Mapping[str, CarFollowing] = {
     model.name: model
-    for model in (CarFollowing("IDM", _drive_idm), CarFollowing("Krauss", _drive_krauss, attributes=(("sigma", "0"),)))
+    for model in (
+        CarFollowing("IDM", _drive_idm),
+        CarFollowing("Krauss", _drive_krauss, attributes=(("sigma", "0"),)),
+        CarFollowing("EIDM", _drive_eidm, attributes=(("sigmaleader", "0"), ("sigmagap", "0"), ("sigmaerror", "0"))),
+    )
 }

@@ -127,6 +127,7 @@ def _follow(connection: Connection, pairs: Sequence[Pair], type_ids: Sequence[st
         vehicle.moveTo(f"{index}f", f"{index}_0", starts_m[index] + pair.front_m[0])
         vehicle.setPreviousSpeed(f"{index}f", pair.speed_mps[0], 0.0)
     driven = [Driven(np.empty(pair.rows), np.empty(pair.rows)) for pair in pairs]
+    changes_mps2 = [np.diff(pair.leader_speed_mps, prepend=pair.leader_speed_mps[:1]) / pair.step_s for pair in pairs]
     for row in range(max(pair.rows for pair in pairs)):
         for index, pair in enumerate(pairs):
             leader, follower = f"{index}l", f"{index}f"
@@ -136,7 +137,7 @@ def _follow(connection: Connection, pairs: Sequence[Pair], type_ids: Sequence[st
                     vehicle.remove(follower)
                 continue
             vehicle.moveTo(leader, f"{index}_0", starts_m[index] + pair.leader_rear_m[row] + _LENGTH_M)
-            vehicle.setPreviousSpeed(leader, pair.leader_speed_mps[row], 0.0)
+            vehicle.setPreviousSpeed(leader, pair.leader_speed_mps[row], changes_mps2[index][row])
             driven[index].front_m[row] = connection.lane_position_m(follower) - starts_m[index]
             driven[index].speed_mps[row] = vehicle.getSpeed(follower)
         connection.step()

@@ -61,6 +61,7 @@ StepS = Annotated[float, Range(0.01, 1.0)]
 Slots = Annotated[int, Range(1, 200)]  # vehicles in an observation
 WindowCount = Annotated[int, Range(1, 100_000_000)]
 LatentCount = Annotated[int, Range(1, 64)]  # of a trait model
+NoLeaderGapM = Annotated[float, Range(1.0, 1000.0)]  # of a trait model
 Gain = Annotated[float, Range(0.001, 1000.0)]
 Weight = Annotated[float, Range(0.0, 1e6)]  # of a term of a loss
 Penalty = Annotated[float, Range(0.0, 1000.0)]  # taken from a reward

@@ -112,14 +112,18 @@ def cut_windows(
     episode: NDArray[np.integer],
     position_m: NDArray[np.floating],
     gap_m: NDArray[np.floating],
+    no_leader_gap_m: float = NO_LEADER_GAP_M,
 ) -> Windows:
-    """Return the windows of rows (M,) that are sorted by driver and time; ``gap_m`` is infinite without a leader."""
+    """Return the windows of rows (M,) that are sorted by driver and time.
+
+    ``gap_m`` is infinite without a leader; in the states it is ``no_leader_gap_m`` at most, which stands for none.
+    """
     first, length = window_rows(driver)
     valid = valid_steps(length)
     row = np.where(valid, first[:, None] + np.arange(WINDOW_STEPS), first[:, None])
     states = np.zeros((*valid.shape, 2), np.float32)
     states[..., 0] = position_m[row] - position_m[first, None]
-    states[..., 1] = np.where(valid, capped(gap_m)[row], 0.0)
+    states[..., 1] = np.where(valid, capped(gap_m, no_leader_gap_m)[row], 0.0)
     has_leader = np.isfinite(gap_m)[row].all(axis=1)
     return Windows(states, length, driver[first], episode[first].astype(np.int64), has_leader)
 
@@ -147,9 +151,9 @@ def valid_steps(length: NDArray[np.int64]) -> NDArray[np.bool_]:
     return np.asarray(np.arange(WINDOW_STEPS) < length[:, None])
 
 
-def capped(gap_m: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return gaps to leaders, infinite without one, as trait models read them: 20 m at most."""
-    return np.asarray(np.minimum(gap_m, NO_LEADER_GAP_M))
+def capped(gap_m: NDArray[np.floating], no_leader_gap_m: float) -> NDArray[np.floating]:
+    """Return gaps to leaders, infinite without one, as trait models read them: ``no_leader_gap_m`` at most."""
+    return np.asarray(np.minimum(gap_m, no_leader_gap_m))
 
 
 def joined(parts: Sequence[Windows]) -> Windows:

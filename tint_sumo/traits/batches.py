@@ -18,23 +18,30 @@ class WindowBatch:
     length: Tensor  # (N,)
     other: "WindowBatch | None" = None  # another window of each window's driver, or the same one if there is no other
     conservative: Tensor | None = None  # (N,) bool, for methods that are trained with labels
+    no_leader_gap_m: float = NO_LEADER_GAP_M  # stands for the gap without a leader, and caps all gaps
 
     def with_noise(self, noise_m: float, generator: torch.Generator) -> "WindowBatch":
         """Return the same windows as if positions had been measured with noise."""
         if noise_m == 0.0:
             return self
-        states = add_position_noise(self.states, noise_m, generator)
+        states = add_position_noise(self.states, noise_m, generator, self.no_leader_gap_m)
         other = None if self.other is None else self.other.with_noise(noise_m, generator)
-        return WindowBatch(states, self.length, other, self.conservative)
+        return replace(self, states=states, other=other)
 
 
 class TrainingWindows:
     """All windows of a training run; ``conservative`` is None for methods that learn without labels."""
 
     def __init__(
-        self, windows: Windows | WindowFile, conservative: Tensor | None = None, *, with_other: bool = False
+        self,
+        windows: Windows | WindowFile,
+        conservative: Tensor | None = None,
+        *,
+        with_other: bool = False,
+        no_leader_gap_m: float = NO_LEADER_GAP_M,
     ) -> None:
         self._windows = windows
+        self._no_leader_gap_m = no_leader_gap_m
         self._conservative = conservative
         self._siblings = Siblings(torch.from_numpy(windows.driver)) if with_other else None
 
@@ -44,7 +51,7 @@ class TrainingWindows:
     def parts(self) -> Iterator[WindowBatch]:
         """Yield all windows in their order, some thousands at a time."""
         for part in self._windows.parts():
-            yield _batch(part)
+            yield self._batch(part)
 
     def batch(self, index: Tensor, generator: torch.Generator) -> WindowBatch:
         """Return the windows (N,) at ``index``, with others that ``generator`` chooses."""
@@ -52,12 +59,12 @@ class TrainingWindows:
         other = None
         if self._siblings is not None:
             chosen = self._siblings.draw(index, generator)
-            other = _batch(self._windows[chosen.numpy()])
-        return replace(_batch(self._windows[index.numpy()]), other=other, conservative=labels)
+            other = self._batch(self._windows[chosen.numpy()])
+        return replace(self._batch(self._windows[index.numpy()]), other=other, conservative=labels)
 
-
-def _batch(windows: Windows) -> WindowBatch:
-    return WindowBatch(torch.from_numpy(windows.states), torch.from_numpy(windows.length))
+    def _batch(self, windows: Windows) -> WindowBatch:
+        states, length = torch.from_numpy(windows.states), torch.from_numpy(windows.length)
+        return WindowBatch(states, length, no_leader_gap_m=self._no_leader_gap_m)
 
 
 class Siblings:
@@ -80,7 +87,9 @@ class Siblings:
         return chosen
 
 
-def add_position_noise(states: Tensor, noise_m: float, generator: torch.Generator) -> Tensor:
+def add_position_noise(
+    states: Tensor, noise_m: float, generator: torch.Generator, no_leader_gap_m: float = NO_LEADER_GAP_M
+) -> Tensor:
     """Return states (N, T, 2) with Gaussian noise of this standard deviation on all positions of all vehicles.
 
     A driver's noise shifts its offset and its gap, the leader's the gap. Offsets still count from the first measured
@@ -88,5 +97,5 @@ def add_position_noise(states: Tensor, noise_m: float, generator: torch.Generato
     """
     driver_m, leader_m = noise_m * torch.randn(2, *states.shape[:2], generator=generator)
     offset, gap = states.unbind(dim=-1)
-    measured_gap = torch.where(gap < NO_LEADER_GAP_M, (gap + leader_m - driver_m).clamp(max=NO_LEADER_GAP_M), gap)
+    measured_gap = torch.where(gap < no_leader_gap_m, (gap + leader_m - driver_m).clamp(max=no_leader_gap_m), gap)
     return torch.stack((offset + driver_m - driver_m[:, :1], measured_gap), dim=-1)

@@ -208,7 +208,7 @@ def encode_windows(model: TraitModel, windows: Windows, *, noise_m: float = 0.0,
     """
     parts = []
     with torch.inference_mode():
-        for states, length in _measured(windows, noise_m, seed):
+        for states, length in _measured(windows, noise_m, seed, model.no_leader_gap_m):
             mean, log_var = model.encode(states, length)
             parts.append(torch.stack((mean, torch.exp(0.5 * log_var))))
     mean, std = torch.cat(parts, dim=1).numpy()
@@ -217,9 +217,12 @@ def encode_windows(model: TraitModel, windows: Windows, *, noise_m: float = 0.0,
     return Latents(mean, std)
 
 
-def _measured(windows: Windows, noise_m: float, seed: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+def _measured(
+    windows: Windows, noise_m: float, seed: int, no_leader_gap_m: float
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Yield states and lengths, a batch at a time; the noise does not depend on the size of the batches."""
-    everything = TrainingWindows(windows).batch(torch.arange(len(windows)), torch.Generator())
+    data = TrainingWindows(windows, no_leader_gap_m=no_leader_gap_m)
+    everything = data.batch(torch.arange(len(windows)), torch.Generator())
     everything = everything.with_noise(noise_m, torch.Generator().manual_seed(seed))
     for index in _batches(len(windows)):
         yield everything.states[index], everything.length[index]
@@ -233,7 +236,7 @@ def _batches(windows: int) -> Iterator[slice]:
 def position_error_m(model: TraitModel, windows: Windows, *, noise_m: float = 0.0, seed: int = 0) -> float | None:
     """Return the root mean square error of positions that the model reconstructs or predicts."""
     generator = torch.Generator().manual_seed(seed)
-    data = TrainingWindows(windows, with_other=model.uses_other_window)
+    data = TrainingWindows(windows, with_other=model.uses_other_window, no_leader_gap_m=model.no_leader_gap_m)
     total, count = 0.0, 0
     with torch.inference_mode():
         for part in _batches(len(windows)):

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from tint_sumo.config import LATENT_SIZE, TraitSettings
+from tint_sumo.config import LATENT_SIZE, NO_LEADER_GAP_M, TraitSettings
 from tint_sumo.core.errors import find_named
 from tint_sumo.traits.batches import WindowBatch
 from tint_sumo.traits.encoder import WindowEncoder
@@ -48,6 +48,7 @@ class TraitModel(nn.Module, ABC):
         super().__init__()
         self.settings = settings
         self.latent_size = latent_size
+        self.no_leader_gap_m = NO_LEADER_GAP_M  # stands for the gap without a leader, and caps all gaps
         self.register_buffer("feature_mean", torch.zeros(len(self.feature_spread)))
         self.register_buffer("feature_scale", torch.ones(len(self.feature_spread)))
         self.encoder = WindowEncoder(len(self.feature_spread), settings, latent_size)

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from tint_sumo.config import LatentCount, TraitSettings
+from tint_sumo.config import NO_LEADER_GAP_M, LatentCount, NoLeaderGapM, TraitSettings
 from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_json, shipped, write_json
@@ -28,6 +28,7 @@ class ModelCard:
     data: dict[str, Any] | None = None  # the training dataset: scene, scene_digest, p_conservative, ...
     seed: Annotated[int, Range(0, 2**64 - 1)] = 0
     input_range: InputRange | None = None
+    no_leader_gap_m: NoLeaderGapM = NO_LEADER_GAP_M
     entries: dict[str, Any] = field(default_factory=dict)
 
 
@@ -41,7 +42,12 @@ def save(model: TraitModel, stem: Path, card: Mapping[str, Any]) -> None:
     ``card`` says about it (data, seed, accuracy). It is written last, so that where there is a card there are weights.
     """
     checksum = write_weights(_weights_file(stem), model.state_dict())
-    described = {"method": model.method, "latent_size": model.latent_size, "settings": asdict(model.settings)}
+    described = {
+        "method": model.method,
+        "latent_size": model.latent_size,
+        "settings": asdict(model.settings),
+        "no_leader_gap_m": model.no_leader_gap_m,
+    }
     write_json(_card_file(stem), {**card, **described, **checksum})
 
 
@@ -88,7 +94,13 @@ def read_card(name_or_path: str | Path) -> ModelCard:
 
 def require_scene(name_or_path: str | Path, scene: str, digest: str, user: str) -> None:
     """Raise InputError if a model was trained in another scene than its user's, or in another version of it."""
-    data = read_card(name_or_path).data or {}
+    card = read_card(name_or_path)
+    if card.no_leader_gap_m != NO_LEADER_GAP_M:
+        raise InputError(
+            f"trait model {name_or_path} knows gaps up to {card.no_leader_gap_m:g} m, and scenes have gaps up to "
+            f"{NO_LEADER_GAP_M:g} m; train one on a dataset of scene {scene}"
+        )
+    data = card.data or {}
     if data.get("scene_digest", digest) != digest:
         raise InputError(
             f"trait model {name_or_path} was trained in scene {data.get('scene')}, {user} is of scene {scene}; "
@@ -146,11 +158,13 @@ def _read_card(stem: Path) -> ModelCard:
 def _build(card: ModelCard, stem: Path) -> TraitModel:
     try:
         with preserved_random_state():
-            return TRAIT_METHODS[card.method](card.settings, card.latent_size)
+            model = TRAIT_METHODS[card.method](card.settings, card.latent_size)
     except (TypeError, ValueError, RuntimeError, IndexError) as error:
         raise InputError(
             f"{_card_file(stem)}: unusable settings ({error}); restore the file or train the model again"
         ) from None
+    model.no_leader_gap_m = card.no_leader_gap_m
+    return model
 
 
 def _weights_file(stem: Path) -> Path:

@@ -95,7 +95,9 @@ class TrackStream:
         index, along = torch.from_numpy(tracks), torch.from_numpy(along_m)
         begins = self._window_steps[index] == 0
         displacement = torch.where(begins, 0.0, along - self._along_m[index])
-        raw = torch.stack([displacement, torch.from_numpy(capped(gap_m).astype(np.float32))], dim=-1)
+        raw = torch.stack(
+            [displacement, torch.from_numpy(capped(gap_m, self._model.no_leader_gap_m).astype(np.float32))], dim=-1
+        )
         features = (raw - self._model.feature_mean) / self._model.feature_scale
         features[:, 0].masked_fill_(begins, 0.0)
         hidden = self._model.encoder.step(features, self._hidden[index].masked_fill_(begins.unsqueeze(-1), 0.0))

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from tint_sumo.config import LATENT_SIZE, TraitSettings
+from tint_sumo.config import LATENT_SIZE, NO_LEADER_GAP_M, TraitSettings
 from tint_sumo.core.checkpoints import (
     damage_reported,
     pack,
@@ -49,6 +49,7 @@ def train(
     seed: int = 0,
     latent_size: int = LATENT_SIZE,
     conservative: NDArray[np.bool_] | None = None,
+    no_leader_gap_m: float = NO_LEADER_GAP_M,
     report: Report = silent,
     card: Mapping[str, Any] | None = None,
 ) -> TraitModel:
@@ -65,6 +66,7 @@ def train(
         seed: of the initial weights, the order of windows and all noise.
         latent_size: numbers that represent a trait.
         conservative: (N,) the true traits, for a method that is trained with them; no other method may have them.
+        no_leader_gap_m: gap that stands for none in the windows, and caps all gaps.
         report: called with the progress.
         card: further entries of the model's card, such as the dataset of the windows.
 
@@ -88,6 +90,7 @@ def train(
         "settings": asdict(settings),
         "windows": len(windows),
         "windows_sha256": _digest(windows),
+        **({} if no_leader_gap_m == NO_LEADER_GAP_M else {"no_leader_gap_m": no_leader_gap_m}),
     }
     with claim_folder(out, identity):
         if (out / f"{RUN_MODEL}.json").exists():
@@ -95,8 +98,11 @@ def train(
         with preserved_random_state():
             torch.manual_seed(_stream_seed(seed, 0))
             model = model_type(settings, latent_size)
+            model.no_leader_gap_m = no_leader_gap_m
         labels = None if conservative is None else torch.from_numpy(conservative)
-        data = TrainingWindows(windows, labels, with_other=model_type.uses_other_window)
+        data = TrainingWindows(
+            windows, labels, with_other=model_type.uses_other_window, no_leader_gap_m=no_leader_gap_m
+        )
         run = _Run(model, data, settings, seed)
         with single_threaded():
             loss = run.fit(out, report)

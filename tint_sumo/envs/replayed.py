@@ -1,6 +1,6 @@
 """Infos of environments among recorded vehicles: the case, who was released, and what is wrong in the recording."""
 
-from dataclasses import asdict, fields
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ def replayed_fields(scene: AnyScene) -> list[tuple[str, Any, tuple[int, ...]]]:
 
 def observe_recording(simulation: ReplaySimulation, rows: Rows) -> None:
     """Write the present values into the row (1,) of a simulation's environment."""
-    values = {"case": simulation.scene.case, "released": simulation.released, **asdict(simulation.faults)}
-    for name, value in values.items():
-        rows[name] = value
+    row = rows[0]
+    row["case"], row["released"] = simulation.scene.case, simulation.released
+    for name, value in vars(simulation.faults).items():
+        row[name] = value

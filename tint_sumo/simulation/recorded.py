@@ -6,6 +6,7 @@ no lane is not there for SUMO, nor for the ego.
 """
 
 import math
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from libsumo import constants
 
-from tint_sumo.scenes.geometry import Bools, Boxes, Numbers, clearance_m, find_meetings, find_overlaps
+from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers, clearance_m, find_meetings, find_overlaps
 from tint_sumo.scenes.replay import NO_TRACK, ReplayScene
 from tint_sumo.simulation.connection import SUMO_ERRORS, Connection
 from tint_sumo.simulation.ego_way import EGO
@@ -72,6 +73,9 @@ class RecordedTraffic:
         if self._case.track != NO_TRACK:
             self._waits[self._case.track] = False
         self._types, self._routes = set[str](), set[str]()
+        self._step_s = scene.step_s
+        self._horizon = round(scene.release_s / scene.step_s)
+        self._every = max(1, round(_AHEAD_S / scene.step_s))
         self.released_so_far = 0
         self._place(self._case.way.box[0])
 
@@ -110,18 +114,13 @@ class RecordedTraffic:
             front_m: of the ego.
             sight_m: from the ego's front to that of a vehicle.
         """
-        recording, tracks, rows = self._recording, *self._present()
-        on_road = recording.on_road[rows]
-        boxes = recording.box[rows]
-        self._count_faults(ego, tracks, boxes, on_road)
-        half_m = boxes["length_m"] / 2
-        x_m, y_m = boxes["x_m"] + half_m * boxes["heading_x"], boxes["y_m"] + half_m * boxes["heading_y"]
-        near = np.hypot(x_m - front_m[0], y_m - front_m[1]) <= sight_m
-        angle_deg = np.degrees(np.arctan2(boxes["heading_x"], boxes["heading_y"]))
+        now = self._now
+        self._count_faults(ego, now)
+        near = np.hypot(now.x_m - front_m[0], now.y_m - front_m[1]) <= sight_m
         found = {
-            str(track): _sight((x_m[index], y_m[index], front_m[2]), angle_deg[index], recording.driven_m[rows[index]])
-            for index, track in enumerate(tracks.tolist())
-            if near[index] and track in self._follow
+            str(track): _sight((x_m, y_m, front_m[2]), angle_deg, driven_m)
+            for track, x_m, y_m, angle_deg, driven_m in now.places(near)
+            if track in self._follow
         }
         for track in self.released:
             sight = self._sight_of(track)
@@ -135,29 +134,33 @@ class RecordedTraffic:
 
     # Following
 
-    def _present(self) -> tuple[Numbers, Numbers]:
-        """Return the numbers of the tracks that have a row at this step and are not released, and their rows."""
+    def _moment(self) -> "_Moment":
+        """Return the vehicles that are recorded at this step and are not released."""
         recording, row = self._recording, self.step - self._recording.first_step
         tracks = np.flatnonzero((row >= 0) & (row < recording.rows) & self._waits)
-        return tracks, recording.first_row[tracks] + row[tracks]
+        rows = recording.first_row[tracks] + row[tracks]
+        boxes = recording.box[rows]
+        half_m = boxes["length_m"] / 2
+        return _Moment(
+            tracks,
+            boxes,
+            recording.on_road[rows],
+            boxes["x_m"] + half_m * boxes["heading_x"],
+            boxes["y_m"] + half_m * boxes["heading_y"],
+            np.degrees(np.arctan2(boxes["heading_x"], boxes["heading_y"])) % 360.0,
+            recording.driven_m[rows],
+        )
 
     def _place(self, ego: Any) -> None:
         """Move the vehicles that follow their recording to where they are at this step."""
-        recording, tracks, rows = self._recording, *self._present()
-        here = set(tracks[recording.on_road[rows]].tolist())
+        now = self._now = self._moment()
+        here = set(now.tracks[now.on_road].tolist())
         for track in self._follow - here:
             self._connection.vehicle.remove(str(track))
         self._follow &= here
-        if not here:
-            return
-        boxes = recording.box[rows]
-        half_m = boxes["length_m"] / 2
-        x_m, y_m = boxes["x_m"] + half_m * boxes["heading_x"], boxes["y_m"] + half_m * boxes["heading_y"]
-        angle_deg = np.degrees(np.arctan2(boxes["heading_x"], boxes["heading_y"])) % 360.0
-        places = zip(tracks.tolist(), x_m.tolist(), y_m.tolist(), angle_deg.tolist(), boxes, strict=True)
-        for track, front_x_m, front_y_m, deg, box in places:
-            if track in here and (track in self._follow or self._appears(track, box, ego)):
-                self._move(track, front_x_m, front_y_m, deg)
+        for place, (track, x_m, y_m, angle_deg, _) in enumerate(now.places(now.on_road)):
+            if track in self._follow or self._appears(track, now.boxes[now.on_road][place], ego):
+                self._move(track, x_m, y_m, angle_deg)
 
     def _move(self, track: int, x_m: float, y_m: float, angle_deg: float) -> None:
         mode = _IGNORE_PERMISSIONS | (_KEEP_ROUTE if self._recording.keeps_route[track] else 0)
@@ -210,11 +213,10 @@ class RecordedTraffic:
 
     def _release(self, driven_m: float, speed_mps: float) -> None:
         """Release the vehicles to which the ego matters, or a vehicle that is released."""
-        recording, scene = self._recording, self._scene
+        recording = self._recording
         tracks = np.fromiter(sorted(self._follow), np.int64, len(self._follow))
         tracks = tracks[recording.drives_on[tracks]]
         meets = np.zeros(len(tracks), bool)
-        steps, every = round(scene.release_s / scene.step_s), max(1, round(_AHEAD_S / scene.step_s))
         vehicle = self._connection.vehicle
         ways = [(self._case.way.box, self._case.way.driven_m, driven_m, speed_mps)]
         for track in self.released:
@@ -228,15 +230,15 @@ class RecordedTraffic:
                 along_m,
                 along_mps,
                 self.step,
-                steps,
-                every,
-                scene.step_s,
+                self._horizon,
+                self._every,
+                self._step_s,
                 tracks,
                 recording.first_step,
                 recording.first_row,
                 recording.rows,
                 recording.box,
-                scene.release_m,
+                self._scene.release_m,
                 meets,
             )
         for track in tracks[meets].tolist():
@@ -284,7 +286,7 @@ class RecordedTraffic:
         if state.beside_m is None:
             moved_m = odometer_m - state.odometer_m
             state.beside_m = self._beside_m(self._row_of(track, state.step), moved_m, (x_m, y_m), angle_deg)
-        share = math.exp(-(self.step - state.step) * self._scene.step_s / _CENTRED_S)
+        share = math.exp(-(self.step - state.step) * self._step_s / _CENTRED_S)
         at_m = (x_m + share * state.beside_m[0], y_m + share * state.beside_m[1], z_m)
         return _sight(at_m, angle_deg, state.way_m + odometer_m - state.odometer_m)
 
@@ -311,15 +313,34 @@ class RecordedTraffic:
 
     # Faults
 
-    def _count_faults(self, ego: Any, tracks: Numbers, boxes: Boxes, on_road: Bools) -> None:
-        """Count what is wrong among the recorded vehicles at this step, (M,) of each argument."""
-        self._off_road = int((~on_road).sum())
-        for index in np.flatnonzero(~on_road).tolist():
-            if tracks[index] not in self._touched and clearance_m(boxes[index], ego) == 0.0:
-                self._touched.add(int(tracks[index]))
-        overlaps = np.zeros((len(tracks), len(tracks)), bool)
-        if len(tracks) and find_overlaps(boxes, overlaps):
-            self._overlapped |= {(int(tracks[a]), int(tracks[b])) for a, b in np.argwhere(overlaps)}
+    def _count_faults(self, ego: Any, now: "_Moment") -> None:
+        """Count what is wrong among the recorded vehicles at this step."""
+        off_road = np.flatnonzero(~now.on_road).tolist()
+        self._off_road = len(off_road)
+        for index in off_road:
+            if now.tracks[index] not in self._touched and clearance_m(now.boxes[index], ego) == 0.0:
+                self._touched.add(int(now.tracks[index]))
+        overlaps = np.zeros((len(now.tracks), len(now.tracks)), bool)
+        if len(now.tracks) and find_overlaps(now.boxes, overlaps):
+            self._overlapped |= {(int(now.tracks[a]), int(now.tracks[b])) for a, b in np.argwhere(overlaps)}
+
+
+@dataclass(frozen=True, eq=False)
+class _Moment:
+    """The M vehicles that are recorded at a step, and are not released."""
+
+    tracks: Numbers  # (M,)
+    boxes: Boxes  # (M,)
+    on_road: Bools  # (M,)
+    x_m: Floats  # (M,) of their fronts
+    y_m: Floats  # (M,)
+    angle_deg: Floats  # (M,) clockwise from north
+    driven_m: Floats  # (M,)
+
+    def places(self, chosen: Bools) -> Iterator[tuple[int, float, float, float, float]]:
+        """Yield track, x, y, angle and distance driven of the chosen vehicles."""
+        columns = (self.tracks, self.x_m, self.y_m, self.angle_deg, self.driven_m)
+        return zip(*(column[chosen].tolist() for column in columns), strict=True)
 
 
 def _sight(front_m: tuple[float, float, float], angle_deg: float, driven_m: float) -> dict[int, Any]:

@@ -95,3 +95,20 @@ def test_files_and_names_that_do_not_exist_are_refused(street: Path, tmp_path: P
         from_tracks(street, recording([WEST]), yields={"nobody": True})
     with pytest.raises(InputError, match="release_s"):
         from_tracks(street, recording([WEST]), release_s=-1.0)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "last_s", "route"),
+    [
+        (6.0, 8.0, ("lower_in.0", "lower_out.0")),  # appears on the junction
+        (30.0, 3.0, ("lower_in.0", "lower_out.0")),  # vanishes there
+        (6.5, 1.0, ("lower_in.0", "lower_out.0")),  # is only seen there
+    ],
+)
+def test_vehicles_seen_on_a_junction_have_the_edges_before_and_behind_it(
+    street: Path, x_m: float, last_s: float, route: tuple[str, ...]
+) -> None:
+    mover = replace(WEST, x_m=x_m, last_s=last_s)
+    (one,) = from_tracks(street, recording([mover, Driven("east", -90.0, UPPER_Y_M, 10.0)]), "east").recordings
+    assert one.routes[one.vehicles.index("west")] == route
+    assert one.keeps_route.all()

@@ -1,5 +1,6 @@
 """Recorded positions on the lanes of a SUMO network, and the routes that lead over them."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -78,7 +79,7 @@ class Lanes:
         nearest_m = np.full(len(boxes), np.inf)
         np.minimum.at(nearest_m, index, beside_m)
         likely = beside_m <= nearest_m[index] + _UNSURE_M
-        route = self._route(boxes, driven_m, index[likely], lane[likely])
+        route = self._with_ends(self._edges_under(boxes, driven_m, index[likely], lane[likely]), lane[likely])
         if not route:
             return Matched((), np.zeros(len(boxes), bool), keeps_route=False)
         on_route = np.zeros(len(boxes), bool)
@@ -103,7 +104,7 @@ class Lanes:
 
     def of_route(self, route: Sequence[str]) -> tuple[Numbers, Floats]:
         """Return the numbers of the lanes of a route, and where each begins along the route; (L,) both."""
-        known = {lane.getID(): number for number, lane in enumerate(self.lanes)}
+        known = self._numbers
         numbers, starts_m, start_m = [], [], 0.0
         edges = [self.net.getEdge(edge) for edge in route]
         for edge, after in pairwise([*edges, None]):
@@ -113,7 +114,7 @@ class Lanes:
             ways = edge.getOutgoing().get(after, []) if after is not None else []
             lengths_m = []
             for way in ways:
-                inner = self._inner(way, known)
+                inner = self._inner(way)
                 numbers += inner
                 lengths_m.append(0.0)
                 for number in inner:
@@ -122,9 +123,15 @@ class Lanes:
             start_m += min(lengths_m, default=0.0)
         return np.array(numbers, np.int64), np.array(starts_m)
 
-    def _inner(self, way: Any, known: dict[str, int]) -> list[int]:
+    @cached_property
+    def _numbers(self) -> dict[str, int]:
+        return {lane.getID(): number for number, lane in enumerate(self.lanes)}
+
+    def _inner(self, way: Any) -> list[int]:
         """Return the numbers of the lanes on a junction by which a connection leads over it."""
-        found, via = [], way.getViaLaneID()
+        known = self._numbers
+        found: list[int] = []
+        via = way.getViaLaneID()
         while via and via in known and known[via] not in found:
             found.append(known[via])
             ways = [way for way in self.lanes[known[via]].getOutgoing() if way.getViaLaneID()]
@@ -148,7 +155,7 @@ class Lanes:
                 route_m[row] = start_m[number] + lane_m[row]
         return Position(lane_of, lane_m, route_m)
 
-    def _route(self, boxes: Boxes, driven_m: Floats, index: Numbers, lane: Numbers) -> tuple[str, ...]:
+    def _edges_under(self, boxes: Boxes, driven_m: Floats, index: Numbers, lane: Numbers) -> list[Any]:
         """Return the connected edges that most of a vehicle's positions are on."""
         on_edges = ~self.is_internal[lane]
         candidates: dict[int, set[str]] = {}
@@ -160,7 +167,7 @@ class Lanes:
                 rows.append(row)
                 last_m = driven_m[row]
         if not rows:
-            return ()
+            return []
         trace = [(point.x, point.y) for point in fronts_of(boxes[rows])]
         vias = {place: sorted(candidates[row]) for place, row in enumerate(rows)}
         edges = sumolib.route.mapTrace(trace, self.net, 0.0, direction=True, fillGaps=_GAP_M, vias=vias)
@@ -169,10 +176,38 @@ class Lanes:
             if runs[-1] and edge not in runs[-1][-1].getOutgoing():
                 runs.append([])
             runs[-1].append(edge)
-        best = max(
-            runs, key=lambda run: sum(not candidates[row].isdisjoint(edge.getID() for edge in run) for row in rows)
-        )
-        return tuple(edge.getID() for edge in [*best, *_following(best[-1])])
+        names = [{edge.getID() for edge in run} for run in runs]
+        counts = [sum(not candidates[row].isdisjoint(run) for row in rows) for run in names]
+        return runs[int(np.argmax(counts))]
+
+    def _with_ends(self, run: list[Any], lane: Numbers) -> tuple[str, ...]:
+        """Return a route with the edges from which and to which a vehicle crosses junctions at its ends.
+
+        There is always one to follow, straight on if nothing is known: nobody arrives where a recording ends.
+
+        Args:
+            run: edges that a vehicle is on; none if it is only seen on a junction.
+            lane: (M,) numbers of all lanes that it is likely to be on.
+        """
+        seen = Counter(way for number in lane.tolist() for way in self._ways_over.get(number, ()))
+        if not run:
+            best = max(seen, key=seen.__getitem__, default=None)
+            return () if best is None else (best.getFrom().getID(), best.getTo().getID())
+        before = [way for way in seen if way.getTo() is run[0]]
+        after = [way for ways in run[-1].getOutgoing().values() for way in ways if way.getTo().getFunction() == ""]
+        first = [max(before, key=seen.__getitem__).getFrom()] if before else []
+        last = [max(after, key=lambda way: (seen[way], way.getDirection() == "s")).getTo()] if after else []
+        return tuple(edge.getID() for edge in [*first, *run, *last])
+
+    @cached_property
+    def _ways_over(self) -> dict[int, list[Any]]:
+        """Connections that lead over each lane on a junction, by its number."""
+        found: dict[int, list[Any]] = {}
+        for edge in self.net.getEdges(withInternal=False):
+            for way in (way for ways in edge.getOutgoing().values() for way in ways):
+                for number in self._inner(way):
+                    found.setdefault(number, []).append(way)
+        return found
 
 
 def fronts_of(boxes: Boxes) -> NDArray[np.object_]:
@@ -192,10 +227,3 @@ def _cosines(boxes: Boxes, fronts: NDArray[np.object_], lines: NDArray[np.object
     dx_m, dy_m = (axis(ends[1]) - axis(ends[0]) for axis in (shapely.get_x, shapely.get_y))
     norm_m = np.maximum(np.hypot(dx_m, dy_m), 1e-9)
     return np.asarray((boxes["heading_x"] * dx_m + boxes["heading_y"] * dy_m) / norm_m)
-
-
-def _following(edge: Any) -> list[Any]:
-    """Return the edge that follows, straight on if possible: a vehicle does not arrive where its recording ends."""
-    ways = [way for ways in edge.getOutgoing().values() for way in ways if way.getTo().getFunction() == ""]
-    straight = [way for way in ways if way.getDirection() == "s"]
-    return [way.getTo() for way in [*straight, *ways][:1]]

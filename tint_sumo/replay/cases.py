@@ -16,6 +16,7 @@ from tint_sumo.scenes.replay import NO_TRACK, Recording, ReplayCase, Way
 from tint_sumo.scenes.sumocfg import measure_route
 
 _LEAST_WAY_M = 10.0  # of an ego
+_BEFORE_END_M = 1.0  # who drives just as recorded comes to the goal before the recording ends
 _LEAST_S = 1.0
 _SPACING_M = 0.5  # of the boxes of a way along lanes
 _SOME = 8  # names in a message
@@ -109,7 +110,7 @@ def _in_place_of(
         return "is never before or behind a junction on its route"
     first = int(np.argmax(on_edge))
     last = int(np.flatnonzero(at.lane >= 0)[-1])
-    start_m, goal_m = float(at.route_m[first]), float(at.route_m[last])
+    start_m, goal_m = float(at.route_m[first]), float(at.route_m[last]) - _BEFORE_END_M
     if goal_m - start_m < _LEAST_WAY_M:
         return f"drives less than {_LEAST_WAY_M:g} m"
     step = int(recording.first_step[track]) + first

@@ -54,9 +54,9 @@ class ReplayEnv(SceneEnv):
     recorded speed.
 
     ## Episode End
-    Termination: the ego passes its goal (``success``), which is where the recorded vehicle was last on its route, or
-    touches another vehicle (``collision``). Truncation: the time limit or the recording's end (``timeout``), or SUMO
-    takes the ego off the road (``lost``).
+    Termination: the ego passes its goal (``success``), which is 1 m before where the recorded vehicle was last on its
+    route, or touches another vehicle (``collision``). Truncation: the time limit or the recording's end (``timeout``),
+    or SUMO takes the ego off the road (``lost``).
 
     What is wrong in the recording, or between it and the network, is never the ego's outcome. Vehicles that touch the
     recorded vehicle in whose place the ego is, or that would appear on the ego, are left out. Vehicles that are on no

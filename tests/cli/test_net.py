@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 
 from tests.cli.calls import run
+from tests.maps.files import commonroad
+from tint_sumo.cli import main
 
 
 def test_net(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -12,3 +14,13 @@ def test_net(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert printed["replicas"] == 2
     assert {Path(file).name for file in printed["files"]} >= {"tint.net.xml", "tint.sumocfg"}
     assert all(Path(file).is_file() for file in printed["files"])
+
+
+def test_a_map_is_imported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["net", "import", str(commonroad(tmp_path / "map.xml")), "--out", str(tmp_path / "net")]
+    printed = run(capsys, *command)
+    assert (printed["format"], printed["roads"], printed["left_hand"]) == ("commonroad", 4, False)
+    assert all(Path(file).is_file() for file in printed["files"])
+    assert main(command) == 2
+    assert "choose another --out, or allow to --overwrite" in capsys.readouterr().err
+    assert main([*command, "--overwrite"]) == 0

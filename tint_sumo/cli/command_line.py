@@ -121,6 +121,7 @@ def parse(words: list[str]) -> Command:
     Raises:
         InputError: the file is not there, a value in it does not fit, a flag comes twice, or a path is a URL.
     """
+    words = _with_build(words)
     _require_each_once(words)
     file = config_of(words)
     *groups, kind = commands_named(TintSumo, words)
@@ -137,6 +138,13 @@ def parse(words: list[str]) -> Command:
     _require_paths(parsed)
     require_ranges(parsed)
     return parsed
+
+
+def _with_build(words: list[str]) -> list[str]:
+    """Return the words with ``net build`` in place of ``net`` alone."""
+    if words[:1] == ["net"] and words[1:2] and words[1].startswith("-") and words[1] not in ("-h", "--help"):
+        return ["net", "build", *words[1:]]
+    return ["net", "build"] if words == ["net"] else words
 
 
 def _require_each_once(words: Sequence[str]) -> None:

@@ -1,16 +1,21 @@
 """``tint-sumo net``."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from tint_sumo.cli.command import Command, Outcome
-from tint_sumo.cli.values import Scene
+from tyro.conf import Positional, Suppress, subcommand
+
+from tint_sumo.cli.command import Command, Outcome, wrote
+from tint_sumo.cli.values import Scene, optional
 from tint_sumo.core.ranges import Range
+
+_FORMAT = optional("NAME", "Format: commonroad, opendrive or osm.", "recognised by the contents")
+_LEFT_HAND = optional("true|false", "Traffic drives on the left.", "as the map says, else on the right")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Net(Command):
+class BuildNet(Command):
     """Build a scene's road network with netconvert, its drivers, and a configuration for plain SUMO."""
 
     scene: Scene = "t_intersection"
@@ -27,3 +32,34 @@ class Net(Command):
         files = write_scene(self.out, scene, self.replicas)
         text = f"wrote {len(files)} files to {self.out}; run them with: sumo -c {self.out / CONFIG_FILE}"
         return Outcome(text, {"replicas": self.replicas, "files": [str(file) for file in files]})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportNet(Command):
+    """Import a map as a SUMO network: OpenDRIVE, OpenStreetMap or CommonRoad."""
+
+    file: Positional[Path]
+    """Map, gzipped or not."""
+    out: Path
+    """Folder for the network and its plain XML."""
+    format: Annotated[str | None, _FORMAT] = None
+    left_hand: Annotated[Literal["true", "false"] | None, _LEFT_HAND] = None
+    overwrite: bool = False
+    """Replace files of the same names."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.maps import import_map
+        from tint_sumo.maps.importing import report
+
+        left_hand = None if self.left_hand is None else self.left_hand == "true"
+        found = import_map(self.file, self.out, format_name=self.format, left_hand=left_hand, overwrite=self.overwrite)
+        files = [str(file) for file in found.files]
+        return Outcome("\n".join([report(found), *wrote(files)]), {**asdict(found), "files": files})
+
+
+# tyro makes subcommands of unions only, hence the None.
+@dataclass(frozen=True)
+class Net:
+    """Road networks for SUMO: of the built-in scenes, or imported from maps. Without a word behind it: build."""
+
+    command: Annotated[BuildNet, subcommand("build")] | Annotated[ImportNet, subcommand("import")] | Suppress[None]

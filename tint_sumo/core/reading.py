@@ -8,6 +8,8 @@ import os
 import stat
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, cast
 
@@ -100,6 +102,20 @@ def is_gzipped(file: IO[bytes]) -> bool:
 def unpacked(file: IO[bytes]) -> IO[bytes]:
     """Return the content of a file that was just opened, whether gzipped or not."""
     return cast("IO[bytes]", gzip.GzipFile(fileobj=file)) if is_gzipped(file) else file
+
+
+@contextmanager
+def opened(path: Path, what: str, most_bytes: int) -> Iterator[IO[bytes]]:
+    """Open a file, gzipped or not, for reading its content in the block.
+
+    Raises:
+        InputError: as in ``open_file``; or the file is damaged.
+    """
+    try:
+        with open_file(path, what, most_bytes) as raw:
+            yield unpacked(raw)
+    except (EOFError, OSError, zlib.error) as error:
+        raise InputError(f"{path} is not whole ({error}); get it again") from None
 
 
 def _unpacks_within(file: IO[bytes], most_bytes: int) -> bool:

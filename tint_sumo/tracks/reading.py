@@ -1,7 +1,6 @@
 """Finds the format of a file and reads its tracks. Each format is one module, imported in ``tint_sumo.tracks``."""
 
 import codecs
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,8 +10,9 @@ from typing import IO, Any
 import numpy as np
 import pandas as pd
 
+from tint_sumo.core import reading
 from tint_sumo.core.errors import InputError, find_named
-from tint_sumo.core.reading import TABLE_BYTES, open_file, require_file, unpacked
+from tint_sumo.core.reading import TABLE_BYTES, require_file
 from tint_sumo.tracks.schema import Tracks, build_tracks
 
 _HEAD_BYTES = 4096  # of a file, from which its format is recognised
@@ -112,11 +112,8 @@ def opened(file: Path) -> Iterator[IO[bytes]]:
     Raises:
         InputError: there is no such file, or it is damaged.
     """
-    try:
-        with open_file(file, _ROLE, TABLE_BYTES) as raw:
-            yield unpacked(raw)
-    except (EOFError, OSError, zlib.error) as error:
-        raise InputError(f"{file} is not whole ({error}); get it again") from None
+    with reading.opened(file, _ROLE, TABLE_BYTES) as content:
+        yield content
 
 
 def recording_name(file: Path) -> str:

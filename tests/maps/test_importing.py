@@ -1,0 +1,216 @@
+"""Maps of several formats as networks that SUMO drives in."""
+
+import gzip
+import subprocess
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import sumolib
+
+from tests.maps.files import CROSSING, PRIORITY, STOP, YIELD, Drawn, commonroad
+from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import write_text
+from tint_sumo.maps import ImportedMap, import_map
+from tint_sumo.maps.importing import report
+from tint_sumo.scenes.network import sumo_program
+
+REAL = Path(__file__).parents[3] / "shared" / "real" / "commonroad"
+
+
+@pytest.fixture(scope="module")
+def crossing(tmp_path_factory: pytest.TempPathFactory) -> ImportedMap:
+    folder = tmp_path_factory.mktemp("crossing")
+    return import_map(commonroad(folder / "crossing.xml"), folder / "net")
+
+
+def network(found: ImportedMap) -> Any:
+    return sumolib.net.readNet(str(found.net), withInternal=True, withPrograms=True)
+
+
+def ways(net: Any) -> Iterator[tuple[Any, Any, int, shapely.LineString]]:
+    """Junction, connection, its number there and its centre line, of every way over a junction."""
+    for node in net.getNodes():
+        for connection in node.getConnections():
+            lane, points = connection.getViaLaneID(), []
+            while lane:
+                points += net.getLane(lane).getShape()
+                last, lane = lane, net.getLane(lane).getOutgoing()[0].getViaLaneID()
+            if points and not connection.getFrom().isSpecial():
+                yield node, connection, node.getInternal().index(last), shapely.LineString(points)
+
+
+def unknown_conflicts(net: Any) -> list[tuple[str, str]]:
+    """Ways from different lanes on which two cars would touch, and neither yields."""
+    found = []
+    for (node, one, number, line), (other_node, other, other_number, other_line) in combinations(ways(net), 2):
+        if node is other_node and one.getFromLane() is not other.getFromLane():
+            shared = line.buffer(1.0, cap_style="flat").intersection(other_line.buffer(1.0, cap_style="flat"))
+            if shared.area > 0.3 and not node.areFoes(number, other_number):
+                found.append((str(one), str(other)))
+    return found
+
+
+def drive(found: ImportedMap, folder: Path) -> str:
+    """Drive between all roads that begin and end at the border; return what SUMO warns of."""
+    net = network(found)
+    starts = [road for road in net.getEdges(withInternal=False) if not road.getIncoming()]
+    ends = [road for road in net.getEdges(withInternal=False) if not road.getOutgoing()]
+    routes = [net.getShortestPath(start, end)[0] for start, end in product(starts, ends)]
+    flows = "".join(
+        f'<flow id="{number}" begin="0" end="100" period="10" departLane="best"><route edges="{edges}"/></flow>'
+        for number, edges in enumerate(" ".join(road.getID() for road in route) for route in routes if route)
+    )
+    assert flows
+    write_text(folder / "flows.xml", f"<routes>{flows}</routes>")
+    run = ["--net-file", found.net, "--route-files", folder / "flows.xml", "--step-length", "0.2", "--no-step-log"]
+    strict = ["--collision.check-junctions", "--collision.action", "warn", "--time-to-teleport", "100"]
+    command = [sumo_program("sumo"), *map(str, run), *strict, "--end", "400", "--duration-log.statistics"]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "Running: 0" in result.stdout
+    return result.stderr.strip()
+
+
+def test_lanelets_become_roads_and_ways_over_a_junction(crossing: ImportedMap) -> None:
+    net = network(crossing)
+    roads = {road.getID(): road.getLaneNumber() for road in net.getEdges(withInternal=False)}
+    assert roads == {"1": 2, "3": 1, "21": 2, "23": 1}  # 21 and 31 are one road
+    found = {(one.getFromLane().getID(), one.getToLane().getID()) for _, one, *_ in ways(net)}
+    assert found == {("1_0", "21_0"), ("1_1", "21_1"), ("3_0", "23_0"), ("3_0", "21_0")}
+    assert net.getLane("21_1").getParam("lanelets") == "22 32"
+    assert net.getLane("21_1").getSpeed() == 12.5
+    assert net.getLane("21_1").getWidth() == pytest.approx(3.5, abs=1e-3)
+    assert (crossing.roads, crossing.lanes, crossing.junctions, crossing.left_out) == (4, 6, 1, ())
+
+
+def test_lanes_lie_on_the_lanelets(crossing: ImportedMap) -> None:
+    net = network(crossing)
+    lines = [net.getLane(lane).getShape() for lane in ("1_0", "1_1", "3_0", "21_0", "23_0")]
+    lines += [list(line.coords) for *_, line in ways(net)]
+    drawn = shapely.union_all([shapely.LineString(one.points) for one in CROSSING.values()])
+    for line in lines:
+        assert max(drawn.distance(shapely.Point(point)) for point in line) < 0.02
+    lengths = [net.getLane(lane).getLength() for lane in ("1_0", "3_0", "21_0")]
+    np.testing.assert_allclose(lengths, 50.0, atol=0.1)
+
+
+def test_conflicts_are_known(crossing: ImportedMap) -> None:
+    net = network(crossing)
+    assert crossing.conflicts == 4  # 13 crosses 11 and 12, 14 merges with 11, and netconvert adds 14 and 12
+    assert not unknown_conflicts(net)
+    assert {node.getType() for node in net.getNodes() if node.getOutgoing() and node.getIncoming()} == {"priority"}
+
+
+def test_vehicles_drive_through(crossing: ImportedMap, tmp_path: Path) -> None:
+    assert not drive(crossing, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("south", "west", "states"), [(YIELD, None, "mM"), (None, YIELD, "Mm"), (PRIORITY, None, "Mm")]
+)
+def test_signs_say_who_yields(tmp_path: Path, south: str | None, west: str | None, states: str) -> None:
+    signed = {**CROSSING, 3: replace(CROSSING[3], sign=south), 1: replace(CROSSING[1], sign=west)}
+    net = network(import_map(commonroad(tmp_path / "map.xml", signed), tmp_path / "net"))
+    found = {one.getFromLane().getID(): one.getState() for _, one, *_ in ways(net) if one.getToLane().getID() != "21_0"}
+    assert found["3_0"] + found["1_1"] == states
+
+
+def test_stop_signs_and_lights(tmp_path: Path) -> None:
+    stop = {**CROSSING, 3: replace(CROSSING[3], sign=STOP)}
+    net = network(import_map(commonroad(tmp_path / "stop.xml", stop), tmp_path / "net"))
+    assert {one.getState() for _, one, *_ in ways(net) if one.getFromLane().getID() == "3_0"} == {"s"}
+    light = {**CROSSING, 3: replace(CROSSING[3], has_light=True)}
+    net = network(import_map(commonroad(tmp_path / "light.xml", light), tmp_path / "net"))
+    assert {node.getType() for node in net.getNodes() if node.getOutgoing() and node.getIncoming()} == {"traffic_light"}
+    assert len(net.getTrafficLights()) == 1
+
+
+def test_long_lanelets_that_cross_are_cut(tmp_path: Path) -> None:
+    lanelets = {1: Drawn([(-100, 0), (100, 0)]), 2: Drawn([(-20, -100), (20, 100)])}
+    found = import_map(commonroad(tmp_path / "cross.xml", lanelets), tmp_path / "net")
+    net = network(found)
+    assert {road.getID() for road in net.getEdges(withInternal=False)} == {"1", "1.1", "2", "2.1"}
+    assert (found.junctions, found.conflicts) == (1, 1)
+    assert max(line.length for *_, line in ways(net)) < 12.0
+    assert not drive(found, tmp_path)
+
+
+def test_lanelets_that_end_within_a_junction_are_left_out(tmp_path: Path) -> None:
+    stub = {**CROSSING, 3: replace(CROSSING[3], successors=[13, 14, 15]), 15: Drawn([(0, -10), (-1, 2)])}
+    found = import_map(commonroad(tmp_path / "stub.xml", stub), tmp_path / "net")
+    assert found.left_out == ("15",)
+    assert "left out" in report(found)
+    assert found.junctions == 1
+
+
+def test_left_hand_traffic(tmp_path: Path) -> None:
+    def mirrored(one: Drawn) -> Drawn:
+        points = [(x, -y) for x, y in one.points]
+        return replace(one, points=points, left=one.right, right=one.left)
+
+    lanelets = {name: mirrored(one) for name, one in CROSSING.items()}
+    found = import_map(commonroad(tmp_path / "left.xml", lanelets), tmp_path / "net", left_hand=True)
+    net = network(found)
+    assert net.getLane("1_0").getShape()[0][1] == pytest.approx(1.75)  # the lane at the left side
+    assert (found.left_hand, found.conflicts) == (True, 4)
+    assert not unknown_conflicts(net)
+    assert not drive(found, tmp_path)
+
+
+def test_a_network_is_the_same_each_time_and_replaces_nothing(tmp_path: Path) -> None:
+    file = commonroad(tmp_path / "map.xml")
+    packed = tmp_path / "map.xml.gz"
+    packed.write_bytes(gzip.compress(file.read_bytes()))
+    first = import_map(file, tmp_path / "net")
+    texts = [path.read_text() for path in first.files]
+    assert all(str(tmp_path) not in text and "<!--" not in text for text in texts)
+    with pytest.raises(InputError, match=r"holds map.net.xml already; choose another `out`, or allow to `overwrite`"):
+        import_map(packed, tmp_path / "net")
+    again = import_map(packed, tmp_path / "net", overwrite=True)
+    assert [path.read_text() for path in again.files] == texts
+    assert {path.name for path in (tmp_path / "net").iterdir()} == {path.name for path in first.files}
+
+
+def test_the_plain_files_give_the_network_again(crossing: ImportedMap, tmp_path: Path) -> None:
+    kinds = [("--node-files", "nod"), ("--edge-files", "edg"), ("--connection-files", "con")]
+    sources = [word for flag, kind in kinds for word in (flag, str(crossing.net).replace(".net.", f".{kind}."))]
+    options = ["--junctions.endpoint-shape", "--offset.disable-normalization", "--no-turnarounds", "--precision", "3"]
+    command = [sumo_program("netconvert"), *sources, *options, "--output-file", str(tmp_path / "again.net.xml")]
+    subprocess.run(command, capture_output=True, check=True)
+    assert (tmp_path / "again.net.xml").read_text().endswith(crossing.net.read_text().partition("<net ")[2])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "is empty"),
+        ("a,b\n1,2\n", "is no map of a known format; give one of these: CommonRoad XML"),
+        ("<net></net>", "is a network of SUMO already"),
+        ("<commonRoad></commonRoad>", "has no lanelets"),
+        ("<commonRoad><lanelet>", "is not whole XML"),
+        ('<commonRoad><lanelet id="1"><leftBound/><rightBound/></lanelet></commonRoad>', "fewer than two points"),
+        ("<OpenDRIVE></OpenDRIVE>", "has no roads|netconvert says"),
+        ("<osm></osm>", "has no roads|netconvert says"),
+        ("<osm", "netconvert says"),
+    ],
+)
+def test_one_line_says_what_is_wrong(tmp_path: Path, content: str, message: str) -> None:
+    write_text(tmp_path / "map.xml", content)
+    with pytest.raises(InputError, match=message) as refused:
+        import_map(tmp_path / "map.xml", tmp_path / "net")
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "net").exists()
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the recorded traffic is not there")
+@pytest.mark.parametrize(("name", "conflicts"), [("USA_Lanker-1_1_T-1", 81), ("USA_Peach-4_8_T-1", 53)])
+def test_real_scenes(tmp_path: Path, name: str, conflicts: int) -> None:
+    found = import_map(REAL / f"{name}.xml", tmp_path / "net")
+    assert (found.junctions, found.conflicts, found.warnings) == (3, conflicts, 0)
+    assert not unknown_conflicts(network(found))
+    assert not drive(found, tmp_path)

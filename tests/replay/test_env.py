@@ -16,6 +16,8 @@ from tests.replay.recordings import LOWER_Y_M, STEM, UPPER_Y_M, Driven, built, r
 from tint_sumo import REPLAY_ENV_ID
 from tint_sumo.config import FittedDriver
 from tint_sumo.core.errors import InputError
+from tint_sumo.drivers.fitted import DriverFit, Fit, Fitted, PairFit, PopulationFit
+from tint_sumo.drivers.models import MODELS
 from tint_sumo.envs import SceneEnv, TaskSettings
 from tint_sumo.replay import EgoOnEdges, ReplayEnv, from_tracks
 from tint_sumo.simulation import ReplaySimulation
@@ -257,3 +259,60 @@ def test_persons_on_foot_are_seen_where_they_are_on_lanes_and_never_released(str
         env.reset(seed=0)
         info, _ = play(env, STOP)
         assert info["released"] == 0
+
+
+def test_fitted_drivers_drive_on_as_they_were_fitted(street: Path) -> None:
+    """The vType of a vehicle with a fit has its parameters, that of another one those of the median driver."""
+    tracks = recording([WEST, FOLLOWER, EAST])
+    fit = fit_of("street/follower", [20.0, 2.0, 3.0, 1.0, 1.5], median=[12.0, 1.1, 2.0, 1.4, 2.2])
+    with made(street, tracks, ego=ACROSS, drivers=fit) as env:
+        env.reset(seed=0)
+        play(env, STOP, 50)
+        vehicle, types = env.simulation.connection.vehicle, env.simulation.connection.vehicletype
+        names = simulation_of(env).scene.recording.vehicles
+        found = {name: vehicle.getTypeID(str(names.index(name))) for name in ("follower", "west")}
+        values = {name: (types.getTau(one), types.getMinGap(one), types.getAccel(one)) for name, one in found.items()}
+        assert values["follower"] == pytest.approx((2.0, 3.0, 1.0))
+        assert values["west"] == pytest.approx((1.1, 2.0, 1.4))
+        # Nobody wants to be faster than the limit of 15 m/s, beyond which nothing was recorded.
+        assert types.getMaxSpeed(found["follower"]) == pytest.approx(15.0)
+        assert types.getMaxSpeed(found["west"]) == pytest.approx(12.0)
+
+
+def fit_of(driver: str, parameters: list[float], median: list[float]) -> Fitted:
+    """A fit of one driver of the Intelligent Driver Model among others."""
+    model = MODELS["IDM"]
+    covariance = tuple(tuple(row) for row in (0.01 * np.eye(len(parameters))).tolist())
+    one, mean = (Fit(tuple(np.log(values)), covariance) for values in (parameters, median))
+    return Fitted(
+        model.name,
+        tuple(parameter.name for parameter in model.parameters),
+        0.1,
+        PopulationFit(mean, covariance, covariance, 0.9, 1.0),
+        (DriverFit(driver, 1, 10.0, one),),
+        (PairFit("pair", driver, 10.0, 0.1, 1.0, one),),
+    )
+
+
+def test_a_vector_has_a_process_for_each_environment(street: Path) -> None:
+    tracks = recording([WEST, FOLLOWER, EAST])
+    vector = gymnasium.make_vec(REPLAY_ENV_ID, num_envs=2, net=street, tracks=tracks)
+    try:
+        _, infos = vector.reset(seed=5)
+        with made(street, tracks) as env:
+            assert [env.reset(seed=seed)[1]["case"] for seed in (5, 6)] == infos["case"].tolist()
+        *_, infos = vector.step(np.array([FAST, FAST]))
+        assert infos["released"].tolist() == [0, 0]
+    finally:
+        vector.close()
+
+
+def test_sumo_can_drive_the_ego(street: Path) -> None:
+    slow = Driven("slow", 40.0, UPPER_Y_M, 4.0, last_s=14.0)
+    with made(street, recording([Driven("ego", -60.0, UPPER_Y_M, 10.0, last_s=14.0), slow]), ego_control="sumo") as env:
+        env.reset(options={"case": 0})
+        assert simulation_of(env).egos.speed_mps[0] == 10.0
+        for _ in range(139):
+            env.step(np.int64(STOP))
+        assert env.simulation.egos.distance_m[0].min() > 0.5
+        assert env.simulation.egos.speed_mps[0] == pytest.approx(4.0, abs=1.0)  # behind the slow one

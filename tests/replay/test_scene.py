@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,6 +72,7 @@ def test_persons_on_foot_are_no_cars(street: Path) -> None:
         ),
         ([WEST], "east", "no recorded vehicle is called 'east'; choose one of west"),
         ([WEST], 7, "ego must be names of recorded vehicles"),
+        ([WEST], [], "ego names no vehicle"),
         ([replace(WEST, last_s=0.5)], None, "recording street of street.csv lasts 0.5 s; give one of at least 1 s"),
         ([replace(WEST, speed_mps=-0.1)], None, "the ego cannot take over vehicle west, which drives less than 10 m"),
         ([WEST], EgoOnEdges(("stem.0", "upper_in.0"), 5.0, 20.0), "no way for passenger cars leads from edge"),
@@ -84,17 +86,32 @@ def test_bad_input_is_one_clear_line(street: Path, vehicles: list[Driven], ego: 
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"net": 5}, "net must be the file of a SUMO network, not 5"),
+        ({"tracks": None}, "tracks must be a file of tracks, or Tracks, not None"),
+        ({"reactive": "yes"}, "reactive must be True or False, not 'yes'"),
+        ({"yields": ["west"]}, "yields must be a mapping"),
+        ({"step_s": 0.0}, "step_s must lie in 0.01 to 1, not 0.0"),
+        ({"step_s": 0.0333}, "step_s must be whole milliseconds"),
+        ({"release_m": -1.0}, "release_m must lie in"),
+        ({"drivers": 3}, "drivers must be the folder of a fit"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused(street: Path, arguments: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {"net": street, "tracks": recording([WEST]), **arguments}
+    with pytest.raises(InputError, match=message):
+        from_tracks(**given)
+
+
 def test_files_and_names_that_do_not_exist_are_refused(street: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no file"):
         from_tracks(tmp_path / "no.net.xml", recording([WEST]))
     with pytest.raises(InputError, match="no file"):
         from_tracks(street, tmp_path / "no.csv")
-    with pytest.raises(InputError, match="drivers must be the folder of a fit"):
-        from_tracks(street, recording([WEST]), drivers=3)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="yields names none of the recorded vehicles"):
         from_tracks(street, recording([WEST]), yields={"nobody": True})
-    with pytest.raises(InputError, match="release_s"):
-        from_tracks(street, recording([WEST]), release_s=-1.0)
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,8 @@ def _names(ego: Any, recordings: Sequence[Recording]) -> tuple[str, ...] | None:
         return None
     names = (ego,) if isinstance(ego, str) else tuple(ego) if isinstance(ego, Sequence) else (ego,)
     known = dict.fromkeys(vehicle for recording in recordings for vehicle in recording.vehicles)
+    if not names:
+        raise InputError("ego names no vehicle; name one, or leave it out for any vehicle")
     for name in names:
         if not isinstance(name, str):
             raise InputError(f"ego must be names of recorded vehicles, an EgoOnEdges or None, not {shown(name)}")

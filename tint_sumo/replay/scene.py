@@ -4,11 +4,12 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 
-from tint_sumo.config import STEP_S, EgoControl, EgoController, Perceivable, RedLight
-from tint_sumo.core.errors import InputError
+from tint_sumo.config import STEP_S, EgoControl, EgoController, Perceivable, RedLight, StepS
+from tint_sumo.core.errors import InputError, shown
 from tint_sumo.replay.cases import Ego, find_cases
 from tint_sumo.replay.drivers import AnyDrivers, attributes_of, find_drivers, types_xml
 from tint_sumo.replay.matching import Lanes
@@ -20,6 +21,7 @@ from tint_sumo.scenes.sumocfg import SumocfgScene, read_net
 from tint_sumo.tracks.reading import read_tracks
 from tint_sumo.tracks.schema import Tracks
 
+_MILLISECOND_PART = 1e-6  # by which rounding may make a step differ from whole milliseconds
 _SIGHT_S = 5.0  # the ego sees as far as it drives in this time
 
 
@@ -49,6 +51,7 @@ def from_tracks(
         InputError: files are missing or damaged, the tracks do not lie on the network, there is no such vehicle, or
             the ego has no way.
     """
+    _require_arguments(net, tracks, reactive, yields, step_s)
     network = read_net(Path(net))
     recorded = tracks if isinstance(tracks, Tracks) else read_tracks(Path(tracks), track_format)
     lanes, labels, who = Lanes(network), vehicle_classes(recorded), find_drivers(drivers)
@@ -87,6 +90,21 @@ def from_tracks(
         release_m=release_m,
         longest_way_m=max(case.goal_m - case.start_m for case in cases),
     )
+
+
+def _require_arguments(net: Any, tracks: Any, reactive: Any, yields: Any, step_s: Any) -> None:
+    """Raise InputError if an argument is something else than it should be."""
+    for name, value, kinds, wanted in (
+        ("net", net, str | Path, "the file of a SUMO network"),
+        ("tracks", tracks, str | Path | Tracks, "a file of tracks, or Tracks"),
+        ("reactive", reactive, bool, "True or False"),
+        ("yields", yields, Mapping | None, "a mapping of names of vehicles to True or False"),
+    ):
+        if not isinstance(value, kinds):
+            raise InputError(f"{name} must be {wanted}, not {shown(value)}")
+    get_args(StepS)[1].require("step_s", step_s)
+    if abs(step_s * 1000 - round(step_s * 1000)) > _MILLISECOND_PART:
+        raise InputError(f"step_s must be whole milliseconds, not {step_s}")
 
 
 def _digest(recordings: Sequence[Recording], cases: Sequence[ReplayCase]) -> str:

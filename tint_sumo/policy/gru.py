@@ -1,10 +1,15 @@
 """A gated recurrent unit over sequences with resets, fast on a processor."""
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+
+from tint_sumo.core.fast_torch import narrow_products
+
+_MANY_PRODUCTS = 1_000_000  # of numbers, in a product of matrices; with fewer, oneDNN's calls take longer than MKL's
 
 
 class ResetGru(nn.Module):
@@ -51,15 +56,16 @@ class _Recurrence(torch.autograd.Function):
         gates = torch.empty_like(projected[..., : 2 * size])  # reset and update
         candidates = torch.empty_like(projected[..., :size])
         outputs = torch.empty_like(candidates)
-        state, recurrent, product_bias = hidden, [], bias.to(weight.dtype)
+        state, recurrent, product_bias, columns = hidden, [], bias.to(weight.dtype), weight.t().contiguous()
         steps = zip(*(t.unbind(0) for t in (projected, keep, gates, candidates, outputs)), strict=True)
-        for project, kept, gate, candidate, output in steps:
-            previous = state * kept
-            product = nn.functional.linear(previous.to(weight.dtype), weight, product_bias).to(hidden.dtype)
-            torch.add(project[:, : 2 * size], product[:, : 2 * size], out=gate).sigmoid_()
-            recurrent.append(product[:, 2 * size :])  # the candidate's recurrent part, before the reset gate
-            torch.addcmul(project[:, 2 * size :], gate[:, :size], recurrent[-1], out=candidate).tanh_()
-            state = torch.lerp(candidate, previous, gate[:, size:], out=output)
+        with _products_of(hidden, weight):
+            for project, kept, gate, candidate, output in steps:
+                previous = state * kept
+                product = torch.addmm(product_bias, previous.to(weight.dtype), columns).to(hidden.dtype)
+                torch.add(project[:, : 2 * size], product[:, : 2 * size], out=gate).sigmoid_()
+                recurrent.append(product[:, 2 * size :])  # the candidate's recurrent part, before the reset gate
+                torch.addcmul(project[:, 2 * size :], gate[:, :size], recurrent[-1], out=candidate).tanh_()
+                state = torch.lerp(candidate, previous, gate[:, size:], out=output)
         ctx.save_for_backward(hidden, keep, weight, gates, candidates, torch.stack(recurrent), outputs)
         return outputs
 
@@ -84,16 +90,22 @@ class _Recurrence(torch.autograd.Function):
         grad_states = torch.empty_like(outputs)
         grad_hidden = torch.zeros_like(hidden)
         steps = [t.unbind(0) for t in (grad_outputs, keep, update, slopes, grad_products, grad_states)]
-        for grad_output, kept, gate, slope, grad_product, grad_state in zip(*map(reversed, steps), strict=True):
-            torch.add(grad_output, grad_hidden, out=grad_state)
-            torch.mul(slope, grad_state.to(weight.dtype).unsqueeze(1), out=grad_product)
-            through_product = grad_product.flatten(1) @ weight
-            grad_hidden = torch.addcmul(through_product.to(hidden.dtype), grad_state, gate).mul_(kept)
+        with _products_of(hidden, weight):
+            for grad_output, kept, gate, slope, grad_product, grad_state in zip(*map(reversed, steps), strict=True):
+                torch.add(grad_output, grad_hidden, out=grad_state)
+                torch.mul(slope, grad_state.to(weight.dtype).unsqueeze(1), out=grad_product)
+                through_product = grad_product.flatten(1) @ weight
+                grad_hidden = torch.addcmul(through_product.to(hidden.dtype), grad_state, gate).mul_(kept)
         flat = grad_products.flatten(0, 1).flatten(1)
         grad_weight = flat.T @ previous.flatten(0, 1).to(weight.dtype)
         grad_bias = flat.sum(0).to(hidden.dtype)
         grad_products[..., 2, :] = candidate_slope.mul_(grad_states)  # now the gradient of ``projected``
         return grad_products.flatten(2).to(hidden.dtype), grad_hidden, None, grad_weight, grad_bias
+
+
+def _products_of(hidden: Tensor, weight: Tensor) -> AbstractContextManager[None]:
+    """Return the block for products of states and weights: small ones would wait for oneDNN."""
+    return narrow_products() if len(hidden) * weight.numel() < _MANY_PRODUCTS else nullcontext()
 
 
 def _tanh_slope(outer: Tensor, output: Tensor) -> Tensor:

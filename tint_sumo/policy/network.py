@@ -13,13 +13,13 @@ from torch import Tensor, nn
 
 from tint_sumo.config import PolicySettings
 from tint_sumo.core.errors import InputError, NotFiniteError
+from tint_sumo.policy.attention import Packing, attend, linear_layers
 from tint_sumo.policy.gru import ResetGru
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
 from tint_sumo.traits.encoder import perceptron
 
 OBSERVATION_KEYS = frozenset({"ego", "vehicles", "mask", TRAITS})
 _ROAD = ("traffic_light", "right_of_way", "speed_limit", "lane")  # keys that observations may have of the ego's road
-_FAR_BELOW = -1e9  # score of an empty slot; finite, so that a street without vehicles gives no NaN
 
 
 class AttentionExtractor(BaseFeaturesExtractor):
@@ -79,36 +79,34 @@ class AttentionExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
         """Return features (B, features_dim) of B observations."""
-        ego = self._gained_ego(observations)
-        slots, rows, embedded = self._embed_vehicles(observations)
-        weights = self._weights(observations["mask"], slots, rows, embedded)
-        chosen = weights.flatten().index_select(0, slots).unsqueeze(-1)
-        weighted = _sum_by_row(embedded * chosen.to(embedded.dtype), rows, len(ego))
+        weighted, _ = self._attend(observations)
         road = [observations[key] for key in self.road]
         if self.sees_pedestrians:
             road.append(self._largest_of_pedestrians(observations))
-        features: Tensor = self.joint(torch.cat([self.context(weighted), ego, *road], dim=-1))
+        joined = torch.cat([self.context(weighted), self._gained_ego(observations), *road], dim=-1)
+        features: Tensor = self.joint(joined)
         return features
 
     def attention(self, observations: dict[str, Tensor]) -> Tensor:
         """Return attention weights (B, V), which sum to 1 over the vehicles and are 0 in empty slots."""
-        return self._weights(observations["mask"], *self._embed_vehicles(observations))
+        return self._attend(observations)[1]
 
     def _gained_ego(self, observations: dict[str, Tensor]) -> Tensor:
         position, velocity = observations["ego"][..., :2], observations["ego"][..., 2:]
         return torch.cat([position * self.position_gain, velocity], dim=-1)
 
-    def _embed_vehicles(self, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the R vehicles of a batch: flat slot index (R,), batch index (R,), embedding (R, embedded)."""
-        rows, columns = _real(observations["mask"]).nonzero(as_tuple=True)
-        slots = rows * observations["mask"].shape[-1] + columns
-        positions = observations["vehicles"].flatten(0, 1).index_select(0, slots) * self.position_gain
-        traits = observations["traits"].flatten(0, 1).index_select(0, slots)
-        ego = self._gained_ego(observations).index_select(0, rows)
-        parts = [positions, traits, ego]
+    def _attend(self, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the sums (B, embedded) of a batch's weighted embeddings, and the weights (B, V)."""
+        packing = Packing.of(observations["mask"])
+        parts = [
+            packing.pack(observations["vehicles"]) * self.position_gain,
+            packing.pack(observations["traits"]),
+            packing.spread(self._gained_ego(observations)),
+        ]
         if self.sees_priority:
-            parts.append(observations["priority"].flatten().index_select(0, slots).unsqueeze(-1))
-        return slots, rows, self.embed(torch.cat(parts, dim=-1))
+            parts.append(packing.pack(observations["priority"].unsqueeze(-1)))
+        score = [] if self.score is None else linear_layers(self.score)
+        return attend(packing, torch.cat(parts, dim=-1), linear_layers(self.embed), score)
 
     def _largest_of_pedestrians(self, observations: dict[str, Tensor]) -> Tensor:
         """Return the largest values (B, F) among the embeddings of a batch's pedestrians, which are 0 or more."""
@@ -116,27 +114,6 @@ class AttentionExtractor(BaseFeaturesExtractor):
         embedded = self.embed_pedestrians(torch.cat([position * self.position_gain, velocity], dim=-1))
         largest: Tensor = (embedded * observations["pedestrian_mask"].unsqueeze(-1)).amax(dim=-2)
         return largest
-
-    def _weights(self, mask: Tensor, slots: Tensor, rows: Tensor, embedded: Tensor) -> Tensor:
-        real = _real(mask)
-        count = real.sum(-1, keepdim=True).clamp(min=1)
-        if self.score is None:
-            return real / count
-        mean = _sum_by_row(embedded, rows, len(mask)) / count
-        scores = self._scores(embedded, mean, rows).squeeze(-1).float()
-        dense = scores.new_full((mask.numel(),), _FAR_BELOW).index_copy(0, slots, scores)
-        return torch.softmax(dense.view_as(mask), dim=-1) * real
-
-    def _scores(self, embedded: Tensor, mean: Tensor, rows: Tensor) -> Tensor:
-        """Return scores (R, 1) from [e_i, mean]; the first layer meets each mean once, not once a vehicle."""
-        assert self.score is not None
-        first = self.score[0]
-        assert isinstance(first, nn.Linear)
-        size = embedded.shape[-1]
-        per_vehicle = nn.functional.linear(embedded, first.weight[:, :size], first.bias)
-        shared = nn.functional.linear(mean.to(embedded.dtype), first.weight[:, size:])
-        scores: Tensor = self.score[1:](per_vehicle + shared.index_select(0, rows))
-        return scores
 
 
 def _with_true_traits(parts: dict[str, Any]) -> dict[str, Any]:
@@ -148,15 +125,6 @@ def _last_axis(space: spaces.Dict, key: str) -> int:
     shape = space[key].shape
     assert shape is not None
     return shape[-1]
-
-
-def _real(mask: Tensor) -> Tensor:
-    return mask > 0.5
-
-
-def _sum_by_row(values: Tensor, rows: Tensor, count: int) -> Tensor:
-    """Return the sums (count, F) of values (R, F) of one row each."""
-    return values.new_zeros(count, values.shape[-1]).index_add(0, rows, values)
 
 
 class GruPolicy(ActorCriticPolicy):

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from tint_sumo.config import PpoSettings
 from tint_sumo.core.errors import DivergedError, InputError
+from tint_sumo.core.fast_torch import keep_freed_memory, wide_products
 from tint_sumo.core.files import whole_file
 from tint_sumo.core.reading import WEIGHTS_BYTES, require_zip
 from tint_sumo.policy.buffer import SequenceBuffer, Sequences, buffer_class
@@ -208,10 +209,11 @@ class RecurrentPPO(OnPolicyAlgorithm):
         self.ent_coef = self.ent_schedule(self._current_progress_remaining)
         self.logger.record("train/ent_coef", self.ent_coef)
         records: dict[str, list[float]] = defaultdict(list)
-        for _ in range(self.n_epochs):
-            for batch in self.rollout_buffer.sequences(self.n_minibatches):
-                for name, value in self._update(batch).items():
-                    records[name].append(value)
+        with wide_products(self.device.type == "cpu"):
+            for _ in range(self.n_epochs):
+                for batch in self.rollout_buffer.sequences(self.n_minibatches):
+                    for name, value in self._update(batch).items():
+                        records[name].append(value)
         self._n_updates += self.n_epochs
         if not all(parameter.isfinite().all() for parameter in self.policy.parameters()):
             raise self._diverged("the weights are not finite")
@@ -283,6 +285,7 @@ class RecurrentPPO(OnPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> Self:
         """Train for ``total_timesteps`` environment steps (further ones, without ``reset_num_timesteps``)."""
+        keep_freed_memory()
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def save(

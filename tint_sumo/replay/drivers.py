@@ -13,6 +13,7 @@ from tint_sumo.drivers.models import CarFollowing, Floats
 from tint_sumo.scenes.replay import Recording
 
 _MODEL = "carFollowModel"
+_LEAST_MPS = 1.0  # where nobody moves
 
 AnyDrivers = FittedDriver | Fitted | str | Path | None  # what users write
 
@@ -37,8 +38,9 @@ def attributes_of(
 ) -> tuple[Mapping[str, float], ...]:
     """Return the attributes of the vType of each recorded vehicle, beside those of its label.
 
-    A fit seldom knows how fast a driver would be on a free road: nobody wants to drive faster than the speed limit or,
-    if that is more, than it was recorded. Slower roads are driven on as much slower.
+    A fit seldom knows how fast a driver would be on a free road. So nobody wants to drive faster than it was recorded
+    at its fastest; those who were slow all the time, by less than half of the others' median, want to be as fast as
+    that median. Roads with lower limits are driven on as much slower.
 
     Args:
         drivers: as in ``find_drivers``.
@@ -47,26 +49,33 @@ def attributes_of(
     """
     if not isinstance(drivers, Fitted):
         return ({},) * len(recording.vehicles)
-    model, median = drivers.car_following, drivers.population.population.mean
+    model, median = drivers.car_following, np.array(drivers.population.mean.log_parameters)
     fits = {fit.name: np.array(fit.fit.log_parameters) for fit in drivers.drivers}
-    ends = recording.first_row + recording.rows
     return tuple(
-        _attributes(
-            model,
-            fits.get(f"{recording.name}/{vehicle}", median),
-            max(float(recording.speed_mps[first:end].max()), limit),
-            limit,
-        )
-        for vehicle, first, end, limit in zip(
-            recording.vehicles, recording.first_row.tolist(), ends.tolist(), limit_mps.tolist(), strict=True
+        _attributes(model, fits.get(f"{recording.name}/{vehicle}", median), most_mps, limit)
+        for vehicle, most_mps, limit in zip(
+            recording.vehicles, _most_mps(recording).tolist(), limit_mps.tolist(), strict=True
         )
     )
+
+
+def _most_mps(recording: Recording) -> Floats:
+    """Return the speeds beyond which drivers do not want to drive; (N,)."""
+    ends = recording.first_row + recording.rows
+    fastest_mps = np.array(
+        [
+            recording.speed_mps[first:end].max()
+            for first, end in zip(recording.first_row.tolist(), ends.tolist(), strict=True)
+        ]
+    )
+    usual_mps = np.median(fastest_mps)
+    return np.where(fastest_mps < usual_mps / 2.0, usual_mps, fastest_mps)
 
 
 def _attributes(model: CarFollowing, log_parameters: Floats, most_mps: float, limit_mps: float) -> dict[str, float]:
     kept = np.clip(log_parameters, model.low, model.high)
     speed = [parameter.name for parameter in model.parameters].index("desired_speed_mps")
-    kept[speed] = min(kept[speed], np.log(most_mps))
+    kept[speed] = min(kept[speed], np.log(max(most_mps, _LEAST_MPS)))
     attributes = model.vtype(kept, limit_mps)
     return {name: float(value) for name, value in attributes.items() if name not in (_MODEL, *_fixed(model))}
 

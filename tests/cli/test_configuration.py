@@ -31,6 +31,7 @@ COMMAND_LINES = (
     "record --out s3://bucket/data --executor ray --address ray://head:10001",
     "dataset inspect data --figure picture.png --verify",
     "tracks inspect tracks.csv --format ngsim --figure tracks.png",
+    "tracks match tracks.csv map.net.xml --out matched.parquet --figure matched.png --shift-m -100 2.5",
     "drivers fit tracks --out fitted --model EIDM --min-duration 15 --step 0.2",
     "drivers export fitted --out drivers --size 20 --seed 3 --speed-limit 27.8",
     "drivers check fitted --recording tracks --repeats 2 --seed 3 --speed-limit 27.8 --format levelx",

@@ -16,6 +16,9 @@ _FORMAT = optional(
     "data with longitudes and latitudes.",
     "recognised by the file's beginning",
 )
+_FIGURE = optional("FILE", "Picture to write: .png, .jpg, .webp, .svg or .pdf.")
+_TABLE = optional("FILE", "Table to write, a row for each of the tracks: .parquet or .csv.")
+_TABLE_SUFFIXES = (".parquet", ".csv")
 TrackFormatName = Annotated[str | None, _FORMAT]
 
 
@@ -26,7 +29,7 @@ class InspectTracks(Command):
     file: Positional[Path]
     """levelX, INTERACTION, NGSIM, TGSIM or leader-follower CSV, CommonRoad XML, or SUMO's floating-car data."""
     format: TrackFormatName = None
-    figure: Annotated[Path | None, optional("FILE", "Picture to write: .png, .jpg, .webp, .svg or .pdf.")] = None
+    figure: Annotated[Path | None, _FIGURE] = None
 
     def run(self) -> Outcome:
         from tint_sumo.tracks import read_tracks
@@ -42,9 +45,43 @@ class InspectTracks(Command):
         return Outcome(text, {"file": str(self.file), **found.summary()})
 
 
+@dataclass(frozen=True, kw_only=True)
+class MatchTracks(Command):
+    """Place recorded tracks on the lanes of a SUMO network, and find the leaders on the ways that vehicles take."""
+
+    tracks: Positional[Path]
+    """Recorded tracks, as tracks inspect reads them."""
+    net: Positional[Path]
+    """SUMO network (.net.xml), for example of net import."""
+    out: Annotated[Path | None, _TABLE] = None
+    figure: Annotated[Path | None, _FIGURE] = None
+    format: TrackFormatName = None
+    shift_m: tuple[float, float] = (0.0, 0.0)
+    """Added to x and y of the tracks, m."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.tracks import match, read_tracks
+        from tint_sumo.tracks.match_report import plot, report, summary
+        from tint_sumo.tracks.matching import write_table
+
+        if self.out is not None:
+            require_output_file(self.out, _TABLE_SUFFIXES)
+        if self.figure is not None:
+            require_output_file(self.figure, PICTURE_SUFFIXES, "figure")
+        matched = match(read_tracks(self.tracks, self.format), self.net, self.shift_m)
+        if self.out is not None:
+            write_table(matched, self.out)
+        if self.figure is not None:
+            plot(matched, self.figure)
+        written = [str(file) for file in (self.out, self.figure) if file is not None]
+        return Outcome("\n".join([report(matched), *wrote(written)]), {**summary(matched), "files": written})
+
+
 # tyro makes subcommands of unions only, hence the None.
 @dataclass(frozen=True)
 class Tracks:
     """Recorded tracks of real or simulated traffic."""
 
-    command: Annotated[InspectTracks, subcommand("inspect")] | Suppress[None]
+    command: (
+        Annotated[InspectTracks, subcommand("inspect")] | Annotated[MatchTracks, subcommand("match")] | Suppress[None]
+    )

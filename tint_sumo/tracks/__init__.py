@@ -6,7 +6,8 @@ from tint_sumo.tracks import interaction as interaction
 from tint_sumo.tracks import leader_follower as leader_follower
 from tint_sumo.tracks import levelx as levelx
 from tint_sumo.tracks import ngsim as ngsim
+from tint_sumo.tracks.matching import Matched, match
 from tint_sumo.tracks.reading import FORMATS, TrackFormat, read_tracks, register
 from tint_sumo.tracks.schema import TRACK_SCHEMA, Tracks
 
-__all__ = ["FORMATS", "TRACK_SCHEMA", "TrackFormat", "Tracks", "read_tracks", "register"]
+__all__ = ["FORMATS", "TRACK_SCHEMA", "Matched", "TrackFormat", "Tracks", "match", "read_tracks", "register"]

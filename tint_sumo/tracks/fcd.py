@@ -35,7 +35,8 @@ def _read_geographic(file: Path) -> Mapping[str, Any]:
     longitude, latitude = rows["x"].to_numpy(), rows["y"].to_numpy()
     if np.abs(longitude).max() > 180.0 or np.abs(latitude).max() > 90.0:
         raise InputError(f"{file} has positions that are no longitudes and latitudes; give the `format` fcd")
-    return _columns(file, rows, *_in_metres(longitude, latitude))
+    crs, x_m, y_m = _in_metres(longitude, latitude)
+    return {**_columns(file, rows, x_m, y_m), "crs": crs}
 
 
 def _columns(file: Path, rows: pd.DataFrame, x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> Mapping[str, Any]:
@@ -58,16 +59,17 @@ def _columns(file: Path, rows: pd.DataFrame, x_m: NDArray[np.float64], y_m: NDAr
 
 def _in_metres(
     longitude: NDArray[np.float64], latitude: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Project to the UTM zone of the mean position."""
+) -> tuple[str, NDArray[np.float64], NDArray[np.float64]]:
+    """Project to the UTM zone of the mean position; return it with x and y."""
     try:
         from pyproj import Transformer  # noqa: PLC0415 - an extra
     except ModuleNotFoundError:
         raise InputError('geographic positions need pyproj; install it: pip install "tint_sumo[geo]"') from None
     zone = int((longitude.mean() + 180.0) // _ZONE_DEG) + 1
     code = (_UTM_NORTH if latitude.mean() >= 0.0 else _UTM_SOUTH) + zone
-    x_m, y_m = Transformer.from_crs("EPSG:4326", f"EPSG:{code}", always_xy=True).transform(longitude, latitude)
-    return np.asarray(x_m), np.asarray(y_m)
+    crs = f"EPSG:{code}"
+    x_m, y_m = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(longitude, latitude)
+    return crs, np.asarray(x_m), np.asarray(y_m)
 
 
 def _is_fcd(head: Head) -> bool:

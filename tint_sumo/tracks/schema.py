@@ -58,6 +58,7 @@ class Tracks:
     file: Path
     format: str  # name of the file format
     table: pd.DataFrame
+    crs: str | None = None  # coordinate reference system of the positions, if they lie on Earth
 
     @property
     def track_number(self) -> NDArray[np.int64]:
@@ -72,7 +73,7 @@ def build_tracks(file: Path, format_name: str, columns: Mapping[str, Any]) -> Tr
     Args:
         file: for messages.
         format_name: name of the file's format.
-        columns: values by the names of ``TRACK_SCHEMA``; single ones stand for all rows.
+        columns: values by the names of ``TRACK_SCHEMA``; single ones stand for all rows. ``crs`` may be among them.
 
     Raises:
         InputError: there is no vehicle, a value is missing, not finite or absurdly large, a box has no size, or a
@@ -103,7 +104,7 @@ def build_tracks(file: Path, format_name: str, columns: Mapping[str, Any]) -> Tr
             f"{file} has {_first(table, twice)} more than once, {twice.sum():,} rows in all; keep one row for each "
             "vehicle and time"
         )
-    return Tracks(file, format_name, table)
+    return Tracks(file, format_name, table, columns.get("crs"))
 
 
 def _first(table: pd.DataFrame, rows: NDArray[np.bool_]) -> str:

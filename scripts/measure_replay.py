@@ -38,8 +38,10 @@ from tint_sumo.simulation import ReplaySimulation, SceneSimulation, Simulation, 
 from tint_sumo.tracks import Tracks, read_tracks
 from tint_sumo.tracks.schema import build_tracks
 
-RESULTS = Path("/tmp/replay/replay.csv")
-SEEDS = range(1)
+RESULTS = Path(__file__).parents[1] / "data" / "results" / "replay.csv"
+SEEDS = range(12)
+HIDDEN = 48  # drivers, whose headway (s), minimum gap (m), acceleration and braking (m/s2) are hidden from fits:
+MEDIANS, SPREADS = (1.2, 2.0, 1.8, 2.5), (0.35, 0.3, 0.3, 0.3)  # log-normal
 RECORDED_S = 60.0
 STARTS_S = tuple(range(5, 46, 5))
 LONGEST_S = 12.0  # of an ego's drive
@@ -64,14 +66,11 @@ class Drive:
 def street() -> Scene:
     """Return the street with drivers who differ."""
     rng = np.random.default_rng(7)
-    drawn = [
-        FittedDriver(*(round(float(value), 3) for value in np.exp(rng.normal(np.log(median), spread))))
-        for _ in range(48)
-        for median, spread in [(np.array([1.2, 2.0, 1.8, 2.5]), np.array([0.35, 0.3, 0.3, 0.3]))]
-    ]
+    drawn = np.exp(rng.normal(np.log(MEDIANS), SPREADS, (HIDDEN, len(MEDIANS))))
+    drivers = tuple(FittedDriver(*(round(value, 3) for value in one)) for one in drawn.tolist())
     scene = find_scene("t_intersection_street")
     base = scene.population
-    population = Population(base.profiles, members=24, seed=base.seed, idm=base.idm, fitted=tuple(drawn))
+    population = Population(base.profiles, members=24, seed=base.seed, idm=base.idm, fitted=drivers)
     return replace(scene, population=population, traffic=replace(scene.traffic, p_conservative=Mix(0.5)))
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from tint_sumo.config import PolicySettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs.perceived import perceived_spaces
-from tint_sumo.policy.network import AttentionExtractor, GruPolicy
+from tint_sumo.policy.network import AttentionExtractor, GruPolicy, QuickTanh
 from tint_sumo.policy.wrappers import TRUE_TRAITS
 
 from .tasks import SMALL, STREET, STREET_WITH_TRAITS, box
@@ -279,3 +279,11 @@ def test_only_the_critic_sees_true_traits() -> None:
     seen = {key: value.numpy() for key, value in scene(5).items()}
     actions, _ = policy.predict(seen, deterministic=True)  # an actor in use has no true traits
     assert actions.shape == (5,)
+
+
+def test_quick_tanh_is_tanh() -> None:
+    inputs = torch.tensor([-200.0, -3.0, -1e-3, 0.0, 0.5, 2.0, 200.0], requires_grad=True)
+    found, expected = QuickTanh()(inputs), inputs.tanh()
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0.0)
+    gradients = [torch.autograd.grad(outputs.square().sum(), inputs)[0] for outputs in (found, expected)]
+    torch.testing.assert_close(*gradients, atol=1e-6, rtol=0.0)

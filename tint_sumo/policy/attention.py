@@ -29,18 +29,22 @@ class Packing:
         slots = real.flatten().nonzero().squeeze(-1)
         streets, columns = mask.shape
         padding = -len(slots) % _BLOCK if torch.is_grad_enabled() else 0
-        rows = functional.pad(slots // columns, (0, padding), value=streets)
+        rows = slots // columns
+        if padding:
+            rows = functional.pad(rows, (0, padding), value=streets)
         starts = functional.pad(real.sum(-1).cumsum(0), (1, 0))
         return cls(slots, rows, starts, real)
 
     def pack(self, values: Tensor) -> Tensor:
         """Return the rows (R, F) of values (B, V, F), zeros in padding."""
         chosen = values.flatten(0, 1).index_select(0, self.slots)
-        return functional.pad(chosen, (0, 0, 0, len(self.rows) - len(chosen)))
+        padding = len(self.rows) - len(chosen)
+        return functional.pad(chosen, (0, 0, 0, padding)) if padding else chosen
 
     def spread(self, values: Tensor) -> Tensor:
         """Return the rows (R, F) of values (B, F) of the streets, zeros in padding."""
-        return functional.pad(values, (0, 0, 0, 1)).index_select(0, self.rows)
+        padded = len(self.rows) > len(self.slots)
+        return (functional.pad(values, (0, 0, 0, 1)) if padded else values).index_select(0, self.rows)
 
     def sums(self, values: Tensor, weights: Tensor | None = None) -> Tensor:
         """Return sums (B, F) over each street's rows of values (R, F), each times its weight (R,)."""

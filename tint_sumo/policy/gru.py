@@ -39,6 +39,10 @@ class ResetGru(nn.Module):
         Returns:
             Outputs (T, N, hidden_size) and the state after the last step (N, hidden_size), float32.
         """
+        if len(inputs) == 1 and not torch.is_grad_enabled() and not torch.is_autocast_enabled(inputs.device.type):
+            kept = hidden * (1.0 - episode_starts[0].to(hidden.dtype)).unsqueeze(-1)
+            state = torch.gru_cell(inputs[0], kept, self.weight_ih, self.weight_hh, self.bias_ih, self.bias_hh)
+            return state.unsqueeze(0), state
         projected = nn.functional.linear(inputs, self.weight_ih, self.bias_ih)
         weight_hh = self.weight_hh.to(projected.dtype)
         keep = (1.0 - episode_starts.to(hidden.dtype)).unsqueeze(-1)

@@ -1,15 +1,18 @@
 """The paper's policy network (III-C): attention over vehicles, a recurrent layer, an actor and a critic."""
 
-from typing import Any
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, cast
 
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.distributions import CategoricalDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.distributions import Categorical
 
 from tint_sumo.config import PolicySettings
 from tint_sumo.core.errors import InputError, NotFiniteError
@@ -127,6 +130,28 @@ def _last_axis(space: spaces.Dict, key: str) -> int:
     return shape[-1]
 
 
+class QuickTanh(nn.Module):
+    """tanh by the logistic function, which torch computes ten times as fast on a processor."""
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        apply: Any = _Tanh.apply
+        return cast(Tensor, apply(inputs))
+
+
+class _Tanh(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor) -> Tensor:
+        outputs = (2.0 * inputs).sigmoid_().mul_(2.0).sub_(1.0)
+        ctx.save_for_backward(outputs)
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (outputs,) = ctx.saved_tensors
+        return cast(Tensor, torch.ops.aten.tanh_backward(grad, outputs))
+
+
 class GruPolicy(ActorCriticPolicy):
     """Actor and critic on a GRU on a features extractor, for Stable-Baselines3.
 
@@ -166,6 +191,7 @@ class GruPolicy(ActorCriticPolicy):
             extractor_kwargs.setdefault("settings", self.settings)
         if not kwargs.keys() & {"optimizer_class", "optimizer_kwargs"}:
             kwargs["optimizer_kwargs"] = {"eps": 1e-5, "fused": True}  # Adam as in Stable-Baselines3, in one pass
+        kwargs.setdefault("activation_fn", QuickTanh)
         heads = list(self.settings.head_sizes)
         super().__init__(
             observation_space,
@@ -210,8 +236,9 @@ class GruPolicy(ActorCriticPolicy):
             outputs = outputs + self.critic_hint(self.critic_extractor(_with_true_traits(obs)))
         return self.mlp_extractor.forward_critic(outputs)
 
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.use_bfloat16 and self.training)
+    def _autocast(self) -> AbstractContextManager[Any]:
+        rounded = self.use_bfloat16 and self.training
+        return torch.autocast(self.device.type, torch.bfloat16) if rounded else nullcontext()
 
     def forward(  # type: ignore[override]
         self, obs: PyTorchObs, states: Tensor, episode_starts: Tensor, deterministic: bool = False
@@ -283,6 +310,12 @@ class GruPolicy(ActorCriticPolicy):
         problem = FloatingPointError(
             "the policy's outputs are not finite: its weights or observations are too large or NaN"
         )
+        if isinstance(self.action_dist, CategoricalDistribution):  # torch would look at the logits several times
+            logits = self.action_net(latent_actor.float())
+            if not logits.isfinite().all():
+                raise problem
+            self.action_dist.distribution = Categorical(logits=logits, validate_args=False)
+            return self.action_dist
         if not latent_actor.isfinite().all():
             raise problem
         try:

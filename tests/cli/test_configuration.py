@@ -23,7 +23,7 @@ from tint_sumo.study.plan import plan, run_study
 # A command line for each command, with as many flags as it has kinds of values.
 COMMAND_LINES = (
     "net build --replicas 3 --scene four_way --out some/net",
-    "net import map.xodr --out some/net --format opendrive --left-hand true --overwrite",
+    "net import map.xodr --out some/net --format lanelet2 --left-hand true --origin 49 -8.4 --overwrite",
     "scene check mine.sumocfg --ego-route in out --start-m 3.5 --goal-m 90 --figure picture.svg",
     "scene check mine.sumocfg --ego-route in out --goal-m 90 --perceives lane pedestrians --red-light end",
     "record --out data --windows 70 --p-conservative 0.2 0.8 --population continuous --format fcd --json",

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+from pyproj import Proj
 
 from tint_sumo.core.files import write_text
 
@@ -32,10 +33,11 @@ class Drawn:
 
 
 def arc(start: tuple[float, float], end: tuple[float, float]) -> list[tuple[float, float]]:
-    """Points of a quarter of an ellipse that begins to the north and ends to the east."""
-    (x, y), (to_x, to_y) = start, end
+    """Points of a quarter of an ellipse between short straight pieces to the north and to the east."""
+    (x, y), (to_x, to_y) = (start[0], start[1] + 0.5), (end[0] - 0.5, end[1])
     angles = np.linspace(0.0, np.pi / 2, 9)
-    return [(x + (to_x - x) * (1 - np.cos(angle)), y + (to_y - y) * np.sin(angle)) for angle in angles]
+    turn = [(x + (to_x - x) * (1 - np.cos(angle)), y + (to_y - y) * np.sin(angle)) for angle in angles]
+    return [start, *turn, end]
 
 
 CROSSING = {
@@ -78,3 +80,52 @@ def _commonroad_lanelet(name: int, one: Drawn) -> str:
     sign = f'<trafficSignRef ref="9{one.sign}"/>' if one.sign else ""
     light = '<trafficLightRef ref="7"/>' if one.has_light else ""
     return f'<lanelet id="{name}">{left}{right}{after}{beside}<speedLimit>12.5</speedLimit>{sign}{light}</lanelet>'
+
+
+def lanelet2(file: Path, lanelets: Mapping[int, Drawn] = CROSSING, shift_deg: tuple[float, float] = (0.0, 0.0)) -> Path:
+    """Write a lanelet2 map in which lanelets that touch share nodes and ways, some of which run against the lanelets.
+
+    Args:
+        file: to write.
+        lanelets: x and y in metres; the map has longitudes and latitudes.
+        shift_deg: latitude and longitude of x = y = 0.
+    """
+    nodes: dict[tuple[float, float], int] = {}
+    ways: dict[tuple[int, ...], int] = {}
+    relations = []
+    for name, one in lanelets.items():
+        sides = []
+        for bound in one.bounds:
+            points = [tuple(np.round(point, 2) + 0.0) for point in bound]
+            way = tuple(nodes.setdefault(point, -(len(nodes) + 1)) for point in points)
+            sides.append(ways.get(way) or ways.get(way[::-1]) or ways.setdefault(way[::-1], len(ways) + 1001))
+        members = "".join(
+            f'<member type="way" ref="{way}" role="{role}"/>'
+            for way, role in zip(sides, ("left", "right"), strict=True)
+        )
+        rules = {YIELD: (901,), PRIORITY: (901,), None: ()}[one.sign]
+        members += "".join(f'<member type="relation" ref="{rule}" role="regulatory_element"/>' for rule in rules)
+        tags = {"type": "lanelet", "subtype": "road", "location": "urban", "one_way": "yes", "speed_limit": "45 km/h"}
+        relations.append(f'<relation id="{name}">{members}{_tags(tags)}</relation>')
+    yields = "".join(
+        f'<member type="relation" ref="{name}" role="{"yield" if one.sign == YIELD else "right_of_way"}"/>'
+        for name, one in lanelets.items()
+        if one.sign
+    )
+    rule = f'<relation id="901">{yields}{_tags({"type": "regulatory_element", "subtype": "right_of_way"})}</relation>'
+    transform = Proj("+proj=utm +zone=31 +datum=WGS84")
+    corner = np.array(transform(shift_deg[1], shift_deg[0]))
+    texts = []
+    for point, number in nodes.items():
+        longitude, latitude = transform(*(corner + point), inverse=True)
+        texts.append(f'<node id="{number}" lat="{latitude:.10f}" lon="{longitude:.10f}"/>')
+    texts += [
+        f'<way id="{number}">{"".join(f"<nd ref={chr(34)}{node}{chr(34)}/>" for node in way)}</way>'
+        for way, number in ways.items()
+    ]
+    write_text(file, f'<?xml version="1.0"?><osm version="0.6">{"".join([*texts, *relations, rule])}</osm>')
+    return file
+
+
+def _tags(tags: Mapping[str, str]) -> str:
+    return "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())

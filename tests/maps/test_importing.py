@@ -13,7 +13,7 @@ import pytest
 import shapely
 import sumolib
 
-from tests.maps.files import CROSSING, PRIORITY, STOP, YIELD, Drawn, commonroad
+from tests.maps.files import CROSSING, PRIORITY, STOP, YIELD, Drawn, commonroad, lanelet2
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
 from tint_sumo.maps import ImportedMap, import_map
@@ -120,6 +120,13 @@ def test_signs_say_who_yields(tmp_path: Path, south: str | None, west: str | Non
     assert found["3_0"] + found["1_1"] == states
 
 
+def test_a_sign_on_a_way_over_the_junction_holds_for_the_road_before_it(tmp_path: Path) -> None:
+    signed = {**CROSSING, 11: replace(CROSSING[11], sign=YIELD), 12: replace(CROSSING[12], sign=YIELD)}
+    net = network(import_map(commonroad(tmp_path / "map.xml", signed), tmp_path / "net"))
+    found = {one.getFromLane().getID(): one.getState() for _, one, *_ in ways(net) if one.getToLane().getID() != "21_0"}
+    assert (found["3_0"], found["1_1"]) == ("M", "m")
+
+
 def test_stop_signs_and_lights(tmp_path: Path) -> None:
     stop = {**CROSSING, 3: replace(CROSSING[3], sign=STOP)}
     net = network(import_map(commonroad(tmp_path / "stop.xml", stop), tmp_path / "net"))
@@ -197,6 +204,7 @@ def test_the_plain_files_give_the_network_again(crossing: ImportedMap, tmp_path:
         ("<OpenDRIVE></OpenDRIVE>", "has no roads|netconvert says"),
         ("<osm></osm>", "has no roads|netconvert says"),
         ("<osm", "netconvert says"),
+        ('<osm><relation id="1"><tag k="type" v="lanelet"/></relation></osm>', "lanelet 1 has no left or no right"),
     ],
 )
 def test_one_line_says_what_is_wrong(tmp_path: Path, content: str, message: str) -> None:
@@ -205,6 +213,43 @@ def test_one_line_says_what_is_wrong(tmp_path: Path, content: str, message: str)
         import_map(tmp_path / "map.xml", tmp_path / "net")
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "net").exists()
+
+
+def lanes_of(found: ImportedMap) -> dict[str, list[tuple[float, float]]]:
+    net = network(found)
+    return {lane.getID(): lane.getShape() for edge in net.getEdges() for lane in edge.getLanes()}
+
+
+def test_lanelet2_gives_the_same_network(crossing: ImportedMap, tmp_path: Path) -> None:
+    found = import_map(lanelet2(tmp_path / "crossing.osm"), tmp_path)
+    assert (found.format, found.junctions, found.conflicts, found.left_hand) == ("lanelet2", 1, 4, False)
+    lanes = lanes_of(found)
+    expected = lanes_of(crossing)
+    assert lanes.keys() == expected.keys()
+    for name, line in expected.items():
+        assert shapely.hausdorff_distance(shapely.LineString(line), shapely.LineString(lanes[name])) < 0.05
+    assert network(found).getLane("1_0").getSpeed() == pytest.approx(12.5)
+    assert not network(found).hasGeoProj()
+    assert not drive(found, tmp_path)
+
+
+def test_right_of_way_of_lanelet2(tmp_path: Path) -> None:
+    signed = {**CROSSING, 1: replace(CROSSING[1], sign=YIELD), 3: replace(CROSSING[3], sign=PRIORITY)}
+    net = network(import_map(lanelet2(tmp_path / "map.osm", signed), tmp_path))
+    found = {one.getFromLane().getID(): one.getState() for _, one, *_ in ways(net) if one.getToLane().getID() != "21_0"}
+    assert (found["3_0"], found["1_1"]) == ("M", "m")
+
+
+def test_lanelet2_on_earth_has_a_projection_and_may_have_an_origin(tmp_path: Path) -> None:
+    file = lanelet2(tmp_path / "map.osm", shift_deg=(48.1, 1.5))
+    net = network(import_map(file, tmp_path / "utm"))
+    longitude, latitude = net.convertXY2LonLat(*net.getLane("3_0").getShape()[-1])
+    assert (latitude, longitude) == pytest.approx((48.1, 1.5), abs=1e-3)
+    net = network(import_map(file, tmp_path / "local", origin=(48.1, 1.5)))
+    assert net.getLane("3_0").getShape()[0] == pytest.approx((0.0, -60.0), abs=0.02)
+    assert net.convertXY2LonLat(0.0, 0.0) == pytest.approx((1.5, 48.1), abs=1e-6)
+    with pytest.raises(InputError, match="leave the `origin` out"):
+        import_map(commonroad(tmp_path / "map.xml"), tmp_path / "other", origin=(48.1, 1.5))
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the recorded traffic is not there")

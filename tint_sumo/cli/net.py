@@ -10,7 +10,12 @@ from tint_sumo.cli.command import Command, Outcome, wrote
 from tint_sumo.cli.values import Scene, optional
 from tint_sumo.core.ranges import Range
 
-_FORMAT = optional("NAME", "Format: commonroad, opendrive or osm.", "recognised by the contents")
+_FORMAT = optional("NAME", "Format: commonroad, lanelet2, opendrive or osm.", "recognised by the contents")
+_ORIGIN = optional(
+    "LATITUDE LONGITUDE",
+    "Degrees of x = y = 0 in a lanelet2 map.",
+    "0 0 for maps that lie there, as INTERACTION's; else x and y are those of UTM",
+)
 _LEFT_HAND = optional("true|false", "Traffic drives on the left.", "as the map says, else on the right")
 
 
@@ -36,7 +41,7 @@ class BuildNet(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class ImportNet(Command):
-    """Import a map as a SUMO network: OpenDRIVE, OpenStreetMap or CommonRoad."""
+    """Import a map as a SUMO network: OpenDRIVE, OpenStreetMap, CommonRoad or lanelet2."""
 
     file: Positional[Path]
     """Map, gzipped or not."""
@@ -44,6 +49,7 @@ class ImportNet(Command):
     """Folder for the network and its plain XML."""
     format: Annotated[str | None, _FORMAT] = None
     left_hand: Annotated[Literal["true", "false"] | None, _LEFT_HAND] = None
+    origin: Annotated[tuple[float, float] | None, _ORIGIN] = None
     overwrite: bool = False
     """Replace files of the same names."""
 
@@ -52,7 +58,14 @@ class ImportNet(Command):
         from tint_sumo.maps.importing import report
 
         left_hand = None if self.left_hand is None else self.left_hand == "true"
-        found = import_map(self.file, self.out, format_name=self.format, left_hand=left_hand, overwrite=self.overwrite)
+        found = import_map(
+            self.file,
+            self.out,
+            format_name=self.format,
+            left_hand=left_hand,
+            origin=self.origin,
+            overwrite=self.overwrite,
+        )
         files = [str(file) for file in found.files]
         return Outcome("\n".join([report(found), *wrote(files)]), {**asdict(found), "files": files})
 

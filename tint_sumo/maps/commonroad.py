@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-from tint_sumo.maps.lanelets import Lanelet, LaneletMap, MapFormat, bound
+from tint_sumo.core.errors import InputError
+from tint_sumo.maps.lanelets import Lanelet, LaneletMap, MapFormat, Origin, bound
 from tint_sumo.maps.xml_files import number, read_elements
 
 _SPEED_SIGNS = ("274", "R2-1")  # of Germany and the United States, as the format names them; values in m/s
@@ -21,7 +22,9 @@ _READ = frozenset({"lanelet", "trafficSign", "location"})
 _LEFT_OUT = frozenset({"obstacle", "dynamicObstacle", "staticObstacle"})
 
 
-def _read(file: Path) -> LaneletMap:
+def _read(file: Path, origin: Origin | None) -> LaneletMap:
+    if origin is not None:
+        raise InputError(f"{file} has x and y in metres; leave the `origin` out")
     found = read_elements(file, _READ, _LEFT_OUT)
     signs = {sign.get("id", ""): sign for sign in found["trafficSign"]}
     whole = [

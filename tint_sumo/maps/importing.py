@@ -16,7 +16,8 @@ import sumolib
 from tint_sumo.core.errors import InputError, find_named
 from tint_sumo.core.files import require_output_folder, write_text
 from tint_sumo.core.reading import TABLE_BYTES, opened
-from tint_sumo.maps import commonroad
+from tint_sumo.maps import commonroad, lanelet2
+from tint_sumo.maps.lanelets import Origin
 from tint_sumo.maps.plain_xml import plain_xml
 from tint_sumo.maps.roads import build_roads
 from tint_sumo.maps.xml_files import ROLE
@@ -24,6 +25,8 @@ from tint_sumo.scenes.network import sumo_program
 
 PARTS = ("nod", "edg", "con", "tll")  # of plain XML
 _HEAD_BYTES = 2**16
+_CHUNK_BYTES, _TAG_BYTES = 2**20, 100
+_LANELET = re.compile(rb"""<tag\s+(k=["']type["']\s+v=["']lanelet["']|v=["']lanelet["']\s+k=["']type["'])""")
 _SHOWN = 10  # lanelets in a report
 _OPTIONS = ("--offset.disable-normalization", "--no-turnarounds", "--precision", "3", "--xml-validation", "never")
 _LANELET_OPTIONS = ("--junctions.endpoint-shape",)  # roads end where their lanelets end
@@ -38,7 +41,7 @@ _NETCONVERT_READS = {
     "opendrive": ("--opendrive-files", "map.xodr", *_OPENDRIVE_OPTIONS),
     "osm": ("--osm-files", "map.osm.xml", *_OSM_OPTIONS),
 }
-LANELET_FORMATS = {found.name: found for found in (commonroad.FORMAT,)}
+LANELET_FORMATS = {found.name: found for found in (commonroad.FORMAT, lanelet2.FORMAT)}
 FORMATS = {
     **{name: found.title for name, found in LANELET_FORMATS.items()},
     "opendrive": "OpenDRIVE",
@@ -67,15 +70,23 @@ class ImportedMap:
 
 
 def import_map(
-    file: Path, out: Path, *, format_name: str | None = None, left_hand: bool | None = None, overwrite: bool = False
+    file: Path,
+    out: Path,
+    *,
+    format_name: str | None = None,
+    left_hand: bool | None = None,
+    origin: Origin | None = None,
+    overwrite: bool = False,
 ) -> ImportedMap:
     """Write a map as a SUMO network in the map's own coordinates.
 
     Args:
-        file: OpenDRIVE, OpenStreetMap or CommonRoad, gzipped or not.
+        file: OpenDRIVE, OpenStreetMap, CommonRoad or lanelet2, gzipped or not.
         out: folder for the network and its plain XML, which are named after the map.
         format_name: one of ``FORMATS``; found by the file's contents if not given.
         left_hand: traffic drives on the left; as the map says if not given, else on the right.
+        origin: latitude and longitude of x = y = 0 in a lanelet2 map. If not given: 0, 0 for maps that lie there, as
+            INTERACTION's do; else x and y are those of UTM.
         overwrite: replace files of the same names.
 
     Raises:
@@ -91,7 +102,7 @@ def import_map(
     if there and not overwrite:
         raise InputError(f"{out} holds {there[0]} already; choose another `out`, or allow to `overwrite`")
     with tempfile.TemporaryDirectory() as folder:
-        built = _build(file, Path(folder), format_name, left_hand)
+        built = _build(file, Path(folder), format_name, left_hand, origin)
         counts = _counts(file, Path(folder) / "map.net.xml")
     for kind, text in built.texts.items():
         write_text(targets[kind], text)
@@ -111,11 +122,24 @@ def find_format(file: Path) -> str:
             raise InputError(f"{file} is empty; give a map")
         found = re.search(r"<(OpenDRIVE|commonRoad|osm|net|nodes|edges|fcd-export)\b", head)
         element = found[1] if found else ""
-    if element in ("OpenDRIVE", "commonRoad", "osm"):
+    if element == "osm":
+        return "lanelet2" if _has_lanelets(file) else "osm"
+    if element in ("OpenDRIVE", "commonRoad"):
         return element.lower()
     if element in ("net", "nodes", "edges"):
         raise InputError(f"{file} is a network of SUMO already; use it as it is")
     raise InputError(f"{file} is no map of a known format; give one of these: {', '.join(FORMATS.values())}")
+
+
+def _has_lanelets(file: Path) -> bool:
+    """Return whether an OSM file has relations of type lanelet."""
+    kept = b""
+    with opened(file, ROLE, TABLE_BYTES) as content:
+        while chunk := content.read(_CHUNK_BYTES):
+            if _LANELET.search(kept + chunk):
+                return True
+            kept = chunk[-_TAG_BYTES:]
+    return False
 
 
 def _name(file: Path) -> str:
@@ -131,10 +155,10 @@ class _Built:
     warnings: int
 
 
-def _build(file: Path, folder: Path, format_name: str, left_hand: bool | None) -> _Built:
+def _build(file: Path, folder: Path, format_name: str, left_hand: bool | None, origin: Origin | None) -> _Built:
     """Run netconvert in a folder, where it leaves ``map.net.xml``."""
     if format_name in LANELET_FORMATS:
-        lanelet_map = LANELET_FORMATS[format_name].read(file)
+        lanelet_map = LANELET_FORMATS[format_name].read(file, origin)
         if not lanelet_map.lanelets:
             raise InputError(f"{file} has no lanelets; give a map with roads")
         if left_hand is not None:
@@ -146,6 +170,8 @@ def _build(file: Path, folder: Path, format_name: str, left_hand: bool | None) -
         inputs = ("--node-files", "map.nod.xml", "--edge-files", "map.edg.xml", "--connection-files", "map.con.xml")
         warnings = _netconvert(file, folder, [*inputs, *_LANELET_OPTIONS], lanelet_map.left_hand)
         return _Built({"net": _text(folder, "net"), **texts}, lanelet_map.left_hand, roads.left_out, warnings)
+    if origin is not None:
+        raise InputError("an `origin` goes with lanelet2 maps; leave it out")
     flag, name, *options = _NETCONVERT_READS[format_name]
     with opened(file, ROLE, TABLE_BYTES) as content, (folder / name).open("wb") as copy:
         copyfileobj(content, copy)

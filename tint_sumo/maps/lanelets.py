@@ -13,6 +13,7 @@ from shapely.ops import substring
 from tint_sumo.core.errors import InputError
 
 Line = NDArray[np.float64]  # (points, 2) in m
+Origin = tuple[float, float]  # latitude and longitude of x = y = 0
 _SAME_POINT_M = 1e-3
 
 
@@ -68,7 +69,7 @@ class MapFormat:
 
     name: str
     title: str  # for people
-    read: Callable[[Path], LaneletMap] = field(repr=False)
+    read: Callable[[Path, Origin | None], LaneletMap] = field(repr=False)
 
 
 def bound(points: Sequence[Sequence[float]], file: Path, lanelet: str) -> Line:

@@ -126,15 +126,22 @@ class _Plan:
             names[node] = names[node] or f"{'to' if kind == 'end' else 'from'}_{ids[number]}"
         return names
 
+    def sign(self, road: int) -> str | None:
+        """Return the sign at the end of a road, or on a way over the junction there."""
+        last = self.chains[road][-1]
+        between = [k for (start, _), places, _ in self.links if start == last for k, _ in places]
+        return next((sign for k in (last, *between) if (sign := self.pieces.sign(k)) is not None), None)
+
     def nodes(self) -> tuple[Node, ...]:
         return tuple(self._node(number, name) for number, name in enumerate(self.node_ids()))
 
     def _node(self, number: int, name: str) -> Node:
         ends = self.ends_at(number)
         x_m, y_m = np.mean([self.point(end) for end in ends], axis=0)
-        last = [self.chains[road][-1] for kind, road in ends if kind == "end"]
-        has_light = any(self.pieces.has_light(k) for k in [*last, *self.inside[number]])
-        return Node(name, float(x_m), float(y_m), tuple(self.pieces.sign(k) for k in last), has_light)
+        here = [road for kind, road in ends if kind == "end"]
+        lights = [*(self.chains[road][-1] for road in here), *self.inside[number]]
+        has_light = any(self.pieces.has_light(k) for k in lights)
+        return Node(name, float(x_m), float(y_m), tuple(self.sign(road) for road in here), has_light)
 
     def roads(self) -> tuple[Road, ...]:
         ids, nodes = self.ids(), self.node_ids()
@@ -145,7 +152,7 @@ class _Plan:
                 nodes[self.meeting["end", number]],
                 tuple(self._lane(chain, lane) for lane in range(len(self.pieces.pieces[chain[0]].lanelets))),
                 self.pieces.speed_mps(chain[0]),
-                self.pieces.sign(chain[-1]),
+                self.sign(number),
             )
             for number, chain in enumerate(self.chains)
         )

@@ -5,13 +5,15 @@ ego, which is the recording, and once with it, which is the truth. Drivers diffe
 braking, which are hidden from the fits, and half of them yield. In CommonRoad scenes all that is known is what happened
 behind the vehicle that the ego takes over from: there one ego drives as that vehicle did.
 
-Writes ``replay.csv`` into data/results: python scripts/measure_replay.py FOLDER_OF_COMMONROAD_SCENES
+Prints how fast the environments are, and writes ``replay.csv`` into data/results:
+python scripts/measure_replay.py FOLDER_OF_COMMONROAD_SCENES
 """
 
 import csv
 import io
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -25,6 +27,7 @@ from tint_sumo.core.files import write_text
 from tint_sumo.drivers.fitted import Fitted, fit_drivers
 from tint_sumo.drivers.models import MODELS
 from tint_sumo.drivers.pairs import find_pairs
+from tint_sumo.envs import SceneEnv, TaskSettings
 from tint_sumo.maps import import_map
 from tint_sumo.methods.rules import GO, STOP, Observation, TimeToCollision, threshold_s
 from tint_sumo.replay import EgoOnEdges, from_tracks
@@ -50,6 +53,7 @@ REACTED_M = 2.0  # a vehicle that is so far from where it was recorded has react
 # The agents of nuPlan's closed loop, idm_agents_observation.yaml in motional/nuplan-devkit; those of MetaDrive and
 # Waymax have other constants, and are alike for everybody, too.
 ONE_FOR_ALL = FittedDriver(tau_s=1.5, min_gap_m=1.0, accel_mps2=1.0, decel_mps2=2.0)
+TURNS, EPISODES, EPISODE_STEPS = 5, 10, 100  # of the comparison of speeds
 OUTCOMES = ("success", "timeout", "collision")
 Positions = dict[tuple[str, int], float]  # x of a vehicle's centre by its name and step
 
@@ -206,10 +210,14 @@ def _fast_mps(speed_mps: Floats) -> float:
     return max(float(np.quantile(speed_mps, 0.9)), 0.1)
 
 
+def ego_of(scene: Scene) -> EgoOnEdges:
+    edges = tuple(name(edge, 0) for edge in scene.ego.edges)
+    return EgoOnEdges(edges, scene.ego.start_m, scene.ego.goal_m, every_s=5.0)
+
+
 def scenes(scene: Scene, recorded: Recorded, net: Path, folder: Path) -> Iterator[tuple[str, ReplayScene]]:
     """Yield names of kinds of drivers, and the recording's scenes with them."""
-    edges = tuple(name(edge, 0) for edge in scene.ego.edges)
-    ego = EgoOnEdges(edges, scene.ego.start_m, scene.ego.goal_m, every_s=5.0)
+    ego = ego_of(scene)
     fitted = fit(recorded, folder)
     labels = {vehicle: member.profile.yields for vehicle, member in recorded.members.items()}
 
@@ -311,6 +319,39 @@ def measure_street(folder: Path) -> Iterator[dict[str, object]]:
                         drives.setdefault((ego, kind), []).append((found.outcome, true[ego, start_s].outcome, compared))
     for (ego, kind), found in drives.items():
         yield row_of("street, recorded here", ego, kind, found)
+
+
+def measure_speed(folder: Path) -> None:
+    """Print steps per second of an environment of the street, and of its recording with as many vehicles, in turns."""
+    scene = street()
+    recorded, net = record(scene, 0), folder / NET_FILE
+    net.write_text(scene_files(scene, 1)[NET_FILE], encoding="utf-8")
+    kinds: dict[str, Scene | ReplayScene] = {"scene": scene}
+    for kind, reactive in (("nobody reacts", False), ("reactive", True)):
+        kinds[kind] = from_tracks(
+            net, recorded.tracks, ego_of(scene), reactive=reactive, max_vehicles=scene.max_vehicles, sight_m=300.0
+        )
+    speeds: dict[str, list[float]] = {kind: [] for kind in kinds}
+    for _ in range(TURNS):
+        for kind, played in kinds.items():
+            speeds[kind].append(steps_per_s(SceneEnv(TaskSettings(played))))
+    first = np.array(speeds["scene"])
+    for kind, found in speeds.items():
+        print(f"{kind}: {np.median(found):,.0f} steps/s, {np.median(np.array(found) / first):.2f} times the scene's")
+
+
+def steps_per_s(env: SceneEnv) -> float:
+    """Return the steps in a second of an ego that stands, without resets."""
+    taken_s, steps = 0.0, 0
+    with closing(env):
+        for seed in range(EPISODES):
+            env.reset(seed=seed)
+            begin_s = time.perf_counter()
+            for _ in range(EPISODE_STEPS):
+                env.step(np.int64(STOP))
+            taken_s += time.perf_counter() - begin_s
+            steps += EPISODE_STEPS
+    return steps / taken_s
 
 
 def row_of(recording: str, ego: str, kind: str, found: Sequence[tuple[str, str, Compared]]) -> dict[str, object]:
@@ -424,6 +465,7 @@ def main() -> None:
     files = sorted(Path(sys.argv[1]).glob("*.xml"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        measure_speed(folder)
         rows = [*measure_street(folder), *(row for file in files for row in measure_commonroad(file, folder))]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")

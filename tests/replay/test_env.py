@@ -252,8 +252,8 @@ def test_persons_on_foot_are_seen_where_they_are_on_lanes_and_never_released(str
     with made(street, tracks, ego="ego") as env:
         env.reset(seed=0)
         times = [step for step in range(140) if (env.step(np.int64(STOP)), boxes(env))[1]]
-        assert times[0] * 0.1 == pytest.approx(3.0 - 0.25, abs=0.2)  # its front is 1 m from the lower lane's border
-        assert times[-1] * 0.1 == pytest.approx(13.0 - 0.25, abs=0.2)
+        assert times[0] * 0.1 == pytest.approx(2.5 - 0.25, abs=0.2)  # its front is 1.5 m from the lower lane's border
+        assert times[-1] * 0.1 == pytest.approx(13.5 - 0.25, abs=0.2)
         assert np.diff(times).max() == 1
     with made(street, tracks, ego="ego") as env:
         env.reset(seed=0)

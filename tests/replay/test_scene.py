@@ -53,6 +53,13 @@ def _quarter_circle() -> NDArray[np.float64]:
     return np.stack([6.0 - 6.0 * np.cos(angle), 6.0 * np.sin(angle)], axis=1)
 
 
+def test_a_recording_can_be_shifted_onto_its_network(street: Path) -> None:
+    far = recording([replace(WEST, x_m=1090.0)])
+    scene, there = from_tracks(street, far, shift_m=(-1000.0, 0.0)), from_tracks(street, recording([WEST]))
+    np.testing.assert_allclose(scene.recordings[0].box["x_m"], there.recordings[0].box["x_m"])
+    assert scene.cases[0].start_m == pytest.approx(there.cases[0].start_m)
+
+
 def test_persons_on_foot_are_no_cars(street: Path) -> None:
     walker = Driven("walker", 20.0, UPPER_Y_M, 1.2, size_m=(0.5, 0.5), vehicle_class="pedestrian")
     scene = from_tracks(street, recording([WEST, walker]))
@@ -68,7 +75,7 @@ def test_persons_on_foot_are_no_cars(street: Path) -> None:
         (
             [replace(WEST, x_m=5000.0)],
             None,
-            "no vehicle of street.csv is on a lane of the network: .* give",
+            "street.net.xml does not belong to street.csv: .* give `shift_m`, or another network",
         ),
         ([WEST], "east", "no recorded vehicle is called 'east'; choose one of west"),
         ([WEST], 7, "ego must be names of recorded vehicles"),

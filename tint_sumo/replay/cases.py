@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import shapely
 
 from tint_sumo.config import SpeedMps, TimeS, VehicleShape
 from tint_sumo.core.errors import InputError, shown
 from tint_sumo.core.ranges import require_ranges
-from tint_sumo.replay.matching import Lanes
-from tint_sumo.replay.recordings import is_on_foot
+from tint_sumo.replay.recordings import Placed, is_on_foot
+from tint_sumo.replay.routes import Routes, is_on_edge
 from tint_sumo.scenes.geometry import Boxes, Floats, clearance_m, new_boxes
 from tint_sumo.scenes.replay import NO_TRACK, Recording, ReplayCase, Way
 from tint_sumo.scenes.sumocfg import measure_route
@@ -42,18 +43,19 @@ Ego = str | Sequence[str] | EgoOnEdges | None  # what users write
 
 
 def find_cases(
-    ego: Ego, recordings: Sequence[Recording], lanes: Lanes, step_s: float, labels: Sequence[str]
+    ego: Ego, placed: Sequence[Placed], routes: Routes, step_s: float, labels: Sequence[str]
 ) -> tuple[ReplayCase, ...]:
     """Return all cases for an ego, in the order of recordings and times.
 
     Raises:
         InputError: no vehicle has the name, the ego has no way, or there is no case.
     """
+    recordings = [one.recording for one in placed]
     if isinstance(ego, EgoOnEdges):
         cases = [
             case
             for number, recording in enumerate(recordings)
-            for case in _on_edges(ego, number, recording, lanes, step_s)
+            for case in _on_edges(ego, number, recording, routes, step_s)
         ]
         if not cases:
             raise InputError("the ego has no room at its start at any time; choose another start_m")
@@ -63,7 +65,7 @@ def find_cases(
     for number, recording in enumerate(recordings):
         for track, vehicle in enumerate(recording.vehicles):
             if names is None or vehicle in names:
-                case = _in_place_of(track, number, recording, lanes, step_s, labels)
+                case = _in_place_of(track, number, placed[number], routes, step_s, labels)
                 if isinstance(case, str):
                     reasons.setdefault(vehicle, case)
                 else:
@@ -97,52 +99,45 @@ def _names(ego: Any, recordings: Sequence[Recording]) -> tuple[str, ...] | None:
 
 
 def _in_place_of(
-    track: int, number: int, recording: Recording, lanes: Lanes, step_s: float, labels: Sequence[str]
+    track: int, number: int, placed: Placed, routes: Routes, step_s: float, labels: Sequence[str]
 ) -> ReplayCase | str:
     """Return the case of an ego in the place of a vehicle, or the reason why there is none."""
+    recording, route = placed.recording, placed.recording.routes[track]
     if is_on_foot(labels[recording.labels[track]]):
         return "is no car"
-    if not recording.routes[track]:
+    if not route:
         return "is on no lane of the network"
-    own = slice(int(recording.first_row[track]), int(recording.first_row[track] + recording.rows[track]))
-    route, boxes = recording.routes[track], recording.box[own]
-    at = lanes.along(route, boxes)
-    on_edge = (at.lane >= 0) & ~lanes.is_internal[at.lane]
-    if not on_edge.any():
+    begin = int(recording.first_row[track])
+    own = slice(begin, begin + int(recording.rows[track]))
+    starts_m, lanes = routes.lane_starts_m(route), placed.lane[own].tolist()
+    rows = [row for row, lane in enumerate(lanes) if lane in starts_m]
+    on_edges = [row for row in rows if is_on_edge(lanes[row])]
+    if not on_edges:
         return "is never before or behind a junction on its route"
-    first = int(np.argmax(on_edge))
-    last = int(np.flatnonzero(at.lane >= 0)[-1])
-    start_m, goal_m = float(at.route_m[first]), float(at.route_m[last]) - _BEFORE_END_M
+    first, last = on_edges[0], rows[-1]
+    start_m, end_m = (starts_m[lanes[row]] + float(placed.lane_m[own][row]) for row in (first, last))
+    goal_m = end_m - _BEFORE_END_M
     if goal_m - start_m < _LEAST_WAY_M:
         return f"drives less than {_LEAST_WAY_M:g} m"
     step = int(recording.first_step[track]) + first
     if (recording.steps - step) * step_s < _LEAST_S:
         return f"appears in the last {_LEAST_S:g} s"
-    size = boxes[first]
-    driven_m = recording.driven_m[own][first:]
+    boxes, driven_m = recording.box[own][first:], recording.driven_m[own][first:]
     return ReplayCase(
         recording=number,
         track=track,
         left_out=_touching(track, recording),
         step=step,
         route=route,
-        route_edge_start_m=_edge_starts_m(route, lanes),
+        route_edge_start_m=routes.edge_starts_m(route),
         start_m=start_m,
         goal_m=goal_m,
-        lane=str(lanes.lanes[at.lane[first]].getID()),
-        lane_m=float(at.lane_m[first]),
+        lane=lanes[first],
+        lane_m=float(placed.lane_m[own][first]),
         speed_mps=float(recording.speed_mps[own][first]),
-        vehicle=VehicleShape(float(size["length_m"]), float(size["width_m"])),
-        way=Way(boxes[first:], driven_m - driven_m[0]),
+        vehicle=VehicleShape(float(boxes[0]["length_m"]), float(boxes[0]["width_m"])),
+        way=Way(boxes, driven_m - driven_m[0]),
     )
-
-
-def _edge_starts_m(route: Sequence[str], lanes: Lanes) -> tuple[float, ...]:
-    numbers, starts_m = lanes.of_route(route)
-    by_edge: dict[str, float] = {}
-    for number, start_m in zip(numbers.tolist(), starts_m.tolist(), strict=True):
-        by_edge.setdefault(lanes.edges[number].getID(), start_m)
-    return tuple(by_edge[edge] for edge in route)
 
 
 def _touching(track: int, recording: Recording) -> tuple[int, ...]:
@@ -169,17 +164,17 @@ def _any_touch(boxes: Boxes, others: Boxes) -> bool:
     return any(clearance_m(boxes[row], others[row]) == 0.0 for row in np.flatnonzero(near))
 
 
-def _on_edges(ego: EgoOnEdges, number: int, recording: Recording, lanes: Lanes, step_s: float) -> list[ReplayCase]:
+def _on_edges(ego: EgoOnEdges, number: int, recording: Recording, routes: Routes, step_s: float) -> list[ReplayCase]:
     """Return the cases of an ego on given edges in a recording, at whose begin it has room."""
-    edge_start_m, spans_m, length_m = measure_route(lanes.net, ego.edges)
+    edge_start_m, spans_m, length_m = measure_route(routes.net, ego.edges)
     if not 0.0 <= ego.start_m < ego.goal_m <= length_m or not any(a <= ego.start_m <= b for a, b in spans_m):
         raise InputError(
             f"the ego's start ({ego.start_m:g} m) and goal ({ego.goal_m:g} m) must lie on its route one behind the "
             f"other, from 0 to {length_m:.1f} m, and its start on no junction"
         )
     edge = max(index for index, start_m in enumerate(edge_start_m) if start_m <= ego.start_m)
-    lane = lanes.net.getEdge(ego.edges[edge]).getLanes()[0]
-    way = _way_along(ego, lanes)
+    lane = routes.net.getEdge(ego.edges[edge]).getLanes()[0]
+    way = _way_along(ego, routes)
     steps = range(0, recording.steps - round(_LEAST_S / step_s) + 1, max(1, round(ego.every_s / step_s)))
     return [
         ReplayCase(
@@ -210,17 +205,19 @@ def _has_room(box: Any, recording: Recording, step: int) -> bool:
     return all(clearance_m(other, box) > 0.0 for other in here)
 
 
-def _way_along(ego: EgoOnEdges, lanes: Lanes) -> Way:
+def _way_along(ego: EgoOnEdges, routes: Routes) -> Way:
     """Return the boxes of an ego along the lanes of its route, from its start to its goal."""
-    numbers, starts_m = lanes.of_route(ego.edges)
-    first = {float(start_m): int(number) for number, start_m in zip(numbers[::-1], starts_m[::-1], strict=True)}
+    lanes: dict[float, str] = {}  # the first that begins there
+    for lane, start_m in routes.lane_starts_m(ego.edges).items():
+        lanes.setdefault(start_m, lane)
     points, along_m = [], []
-    for start_m in sorted(first):
-        line = lanes.lines[first[start_m]]
+    for start_m, name in sorted(lanes.items()):
+        lane = routes.net.getLane(name)
+        line = shapely.LineString(lane.getShape())
         for share in np.linspace(0.0, 1.0, max(2, int(line.length / _SPACING_M))):
             point = line.interpolate(share, normalized=True)
             points.append((point.x, point.y))
-            along_m.append(start_m + share * float(lanes.lanes[first[start_m]].getLength()))
+            along_m.append(start_m + share * float(lane.getLength()))
     line_m, at = np.array(along_m), np.array(points)
     wanted_m: Floats = np.arange(ego.start_m, ego.goal_m, _SPACING_M)
     front, back = (

@@ -60,7 +60,7 @@ class ReplayEnv(SceneEnv):
 
     What is wrong in the recording, or between it and the network, is never the ego's outcome. Vehicles that touch the
     recorded vehicle in whose place the ego is, or that would appear on the ego, are left out. Vehicles that are on no
-    lane, more than 1 m beyond its border, are neither seen nor touched while they are. Both are counted:
+    lane, more than 1.5 m beyond its border, are neither seen nor touched while they are. Both are counted:
 
     ## Information
     As in ``tint_sumo.envs.SceneEnv``, ``traits`` being numbers in ``scene.vtypes``, the classes of the recording; and
@@ -89,6 +89,7 @@ class ReplayEnv(SceneEnv):
       them; default: all do.
     * `release_s`, `release_m`: 4 s and 0.5 m; see above.
     * `track_format`: format of the recording; default: recognised.
+    * `shift_m`: x and y that are added to the recording's positions; geographic ones are projected as the network is.
     * `step_s`: step of the simulation; default 0.1 s.
     * `max_vehicles`, `sight_m`, `controller`, `ego_control`, `perceives`, `red_light`, `red_light_penalty`: as in
       ``tint_sumo.scenes.from_sumocfg``.

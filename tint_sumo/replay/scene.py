@@ -8,12 +8,13 @@ from typing import Any, get_args
 
 import numpy as np
 
-from tint_sumo.config import STEP_S, EgoControl, EgoController, Perceivable, RedLight, StepS
+from tint_sumo.config import STEP_S, EgoControl, EgoController, FittedDriver, Perceivable, RedLight, StepS
 from tint_sumo.core.errors import InputError, shown
+from tint_sumo.drivers.fitted import Fitted
 from tint_sumo.replay.cases import Ego, find_cases
 from tint_sumo.replay.drivers import AnyDrivers, attributes_of, find_drivers, types_xml
-from tint_sumo.replay.matching import Lanes
 from tint_sumo.replay.recordings import read_recordings, vehicle_classes
+from tint_sumo.replay.routes import Routes
 from tint_sumo.scenes.replay import Recording, ReplayCase, ReplayScene
 from tint_sumo.scenes.sumo_config import SumoConfig
 from tint_sumo.scenes.sumo_run import require_loads
@@ -34,6 +35,7 @@ def from_tracks(
     drivers: AnyDrivers = None,
     yields: Mapping[str, bool] | None = None,
     track_format: str | None = None,
+    shift_m: Sequence[float] = (0.0, 0.0),
     release_s: float = ReplayScene.release_s,
     release_m: float = ReplayScene.release_m,
     step_s: float = STEP_S,
@@ -54,17 +56,14 @@ def from_tracks(
     _require_arguments(net, tracks, reactive, yields, step_s)
     network = read_net(Path(net))
     recorded = tracks if isinstance(tracks, Tracks) else read_tracks(Path(tracks), track_format)
-    lanes, labels, who = Lanes(network), vehicle_classes(recorded), find_drivers(drivers)
-    recordings = read_recordings(recorded, lanes, step_s, labels, yields or {})
-    recordings = tuple(
-        replace(one, attributes=attributes_of(who, one, np.array([lanes.limit_mps(route) for route in one.routes])))
-        for one in recordings
-    )
-    cases = find_cases(ego, recordings, lanes, step_s, labels)
+    routes, labels, who = Routes(network), vehicle_classes(recorded), find_drivers(drivers)
+    placed = read_recordings(recorded, Path(net), shift_m, routes, step_s, labels, yields or {})
+    cases = find_cases(ego, placed, routes, step_s, labels)
+    recordings = tuple(_with_drivers(one.recording, who, routes) for one in placed)
     options = (("net-file", str(Path(net).absolute())), ("step-length", f"{step_s:g}"), ("time-to-teleport", "-1"))
     config = SumoConfig(Path(net).absolute(), options, ())
     require_loads(config)
-    top_mps = max(lanes.limit_mps(case.route) for case in cases)
+    top_mps = max(routes.limit_mps(case.route) for case in cases)
     driven = controller or EgoController((0.0, top_mps / 2, top_mps))
     if yields and not any(name in recording.vehicles for recording in recordings for name in yields):
         raise InputError(f"yields names none of the recorded vehicles, but {next(iter(yields))!r}; use their names")
@@ -90,6 +89,11 @@ def from_tracks(
         release_m=release_m,
         longest_way_m=max(case.goal_m - case.start_m for case in cases),
     )
+
+
+def _with_drivers(recording: Recording, drivers: Fitted | FittedDriver | None, routes: Routes) -> Recording:
+    limits_mps = np.array([routes.limit_mps(route) for route in recording.routes])
+    return replace(recording, attributes=attributes_of(drivers, recording, limits_mps))
 
 
 def _require_arguments(net: Any, tracks: Any, reactive: Any, yields: Any, step_s: Any) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pytest
@@ -250,6 +251,77 @@ def test_lanelet2_on_earth_has_a_projection_and_may_have_an_origin(tmp_path: Pat
     assert net.convertXY2LonLat(0.0, 0.0) == pytest.approx((1.5, 48.1), abs=1e-6)
     with pytest.raises(InputError, match="leave the `origin` out"):
         import_map(commonroad(tmp_path / "map.xml"), tmp_path / "other", origin=(48.1, 1.5))
+
+
+def test_opendrive(crossing: ImportedMap, tmp_path: Path) -> None:
+    command = [sumo_program("netconvert"), "--sumo-net-file", crossing.net, "--opendrive-output", tmp_path / "map.xodr"]
+    subprocess.run(list(map(str, command)), capture_output=True, check=True)
+    found = import_map(tmp_path / "map.xodr", tmp_path / "right")
+    assert (found.format, found.roads, found.lanes, found.left_hand) == ("opendrive", 4, 6, False)
+    lines = [shapely.LineString(line) for line in lanes_of(found).values()]
+    for name in ("1_0", "1_1", "3_0", "21_0", "21_1", "23_0"):  # where they were
+        there = shapely.LineString(lanes_of(crossing)[name])
+        assert min(shapely.hausdorff_distance(there, line) for line in lines) < 0.5
+    text = (tmp_path / "map.xodr").read_text().replace("<road ", '<road rule="LHT" ')
+    packed = tmp_path / "map.xml.gz"
+    packed.write_bytes(gzip.compress(text.encode()))
+    left = import_map(packed, tmp_path / "left")
+    assert (left.format, left.left_hand, left.net.name) == ("opendrive", True, "map.net.xml")
+
+
+def osm(file: Path) -> Path:
+    """A street with a light where another crosses it, and a footway."""
+    places = [
+        (48.1020, 11.5000),
+        (48.1020, 11.5030),
+        (48.1020, 11.5060),
+        (48.1, 11.503),
+        (48.104, 11.503),
+        (48.105, 11.5),
+    ]
+    light = '<tag k="highway" v="traffic_signals"/>'
+    nodes = "".join(
+        f'<node id="{number}" lat="{latitude}" lon="{longitude}">{light if number == 2 else ""}</node>'
+        for number, (latitude, longitude) in enumerate(places, 1)
+    )
+    ways = "".join(
+        f'<way id="{number}">{"".join(f"<nd ref={chr(34)}{node}{chr(34)}/>" for node in along)}'
+        f'<tag k="highway" v="{kind}"/><tag k="lanes" v="2"/></way>'
+        for number, kind, along in ((10, "primary", (1, 2, 3)), (11, "residential", (4, 2, 5)), (12, "footway", (5, 6)))
+    )
+    write_text(file, f'<?xml version="1.0"?><osm version="0.6">{nodes}{ways}</osm>')
+    return file
+
+
+def test_openstreetmap(tmp_path: Path) -> None:
+    found = import_map(osm(tmp_path / "map.osm.xml"), tmp_path)
+    net = network(found)
+    assert (found.format, found.roads, found.junctions > 0, found.left_hand) == ("osm", 8, True, False)
+    assert len(net.getTrafficLights()) == 1
+    assert net.convertXY2LonLat(*net.getNode("2").getCoord()) == pytest.approx((11.503, 48.102), abs=1e-6)
+    assert net.getNode("2").getCoord()[0] > 1e5  # in UTM, not moved to the corner
+    assert "tll" in {path.name.split(".")[-2] for path in found.files}
+    assert not drive(found, tmp_path)
+    assert import_map(tmp_path / "map.osm.xml", tmp_path / "left", left_hand=True).left_hand
+
+
+@pytest.mark.parametrize("name", ["7 8", 'a"b', "", "<x>"])
+def test_ids_that_sumo_does_not_take_are_refused(tmp_path: Path, name: str) -> None:
+    text = commonroad(tmp_path / "map.xml").read_text().replace('id="3"', f"id={quoteattr(name)}")
+    write_text(tmp_path / "map.xml", text)
+    with pytest.raises(InputError, match="is no id"):
+        import_map(tmp_path / "map.xml", tmp_path / "net")
+
+
+def test_neighbours_in_a_ring_and_lanelets_that_follow_themselves_are_roads(tmp_path: Path) -> None:
+    odd = {
+        1: Drawn([(0, 0), (60, 0)], [1], left=2, right=2),
+        2: Drawn([(0, 3.5), (60, 3.5)], [9], left=1, right=1),
+        3: Drawn([(0, 50), (60, 50)], [3, 3], left=3),
+    }
+    found = import_map(commonroad(tmp_path / "odd.xml", odd), tmp_path)
+    assert {name.split("_")[0] for name in lanes_of(found)} >= {"2"}
+    assert found.lanes + len(found.left_out) == 3
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the recorded traffic is not there")

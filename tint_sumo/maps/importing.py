@@ -13,7 +13,7 @@ from shutil import copyfileobj
 
 import sumolib
 
-from tint_sumo.core.errors import InputError, find_named
+from tint_sumo.core.errors import InputError, find_named, shown
 from tint_sumo.core.files import require_output_folder, write_text
 from tint_sumo.core.reading import TABLE_BYTES, opened
 from tint_sumo.maps import commonroad, lanelet2
@@ -27,6 +27,7 @@ PARTS = ("nod", "edg", "con", "tll")  # of plain XML
 _HEAD_BYTES = 2**16
 _CHUNK_BYTES, _TAG_BYTES = 2**20, 100
 _LANELET = re.compile(rb"""<tag\s+(k=["']type["']\s+v=["']lanelet["']|v=["']lanelet["']\s+k=["']type["'])""")
+_ID = r"[\w-]+"
 _SHOWN = 10  # lanelets in a report
 _OPTIONS = ("--offset.disable-normalization", "--no-turnarounds", "--precision", "3", "--xml-validation", "never")
 _LANELET_OPTIONS = ("--junctions.endpoint-shape",)  # roads end where their lanelets end
@@ -161,6 +162,9 @@ def _build(file: Path, folder: Path, format_name: str, left_hand: bool | None, o
         lanelet_map = LANELET_FORMATS[format_name].read(file, origin)
         if not lanelet_map.lanelets:
             raise InputError(f"{file} has no lanelets; give a map with roads")
+        for lanelet in lanelet_map.lanelets:
+            if not re.fullmatch(_ID, lanelet):
+                raise InputError(f"{file}: {shown(lanelet)} is no id that SUMO takes for a lanelet; give it a number")
         if left_hand is not None:
             lanelet_map = replace(lanelet_map, left_hand=left_hand)
         roads = build_roads(lanelet_map)

@@ -95,15 +95,15 @@ def cut_to_pieces(lanelet_map: LaneletMap) -> Pieces:
 def _groups(lanelet_map: LaneletMap) -> list[tuple[str, ...]]:
     """Return the lanelets that lie beside each other, in each group from the side of the road to its middle."""
     lanelets = lanelet_map.lanelets
+    firsts = [name for name in lanelets if _beside(lanelets, name, "right_neighbour") is None]
     groups = []
-    for first in lanelets:
-        if _beside(lanelets, first, "right_neighbour") is not None:
-            continue
+    for first in firsts:
         group = [first]
         while (left := _beside(lanelets, group[-1], "left_neighbour")) is not None:
             group.append(left)
         groups.append(tuple(reversed(group) if lanelet_map.left_hand else group))
-    return groups
+    grouped = {name for group in groups for name in group}
+    return groups + [(name,) for name in lanelets if name not in grouped]  # rings of neighbours are a mistake
 
 
 def _beside(lanelets: Mapping[str, Lanelet], name: str, side: str) -> str | None:

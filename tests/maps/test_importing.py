@@ -1,6 +1,7 @@
 """Maps of several formats as networks that SUMO drives in."""
 
 import gzip
+import re
 import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
@@ -205,6 +206,7 @@ def test_the_plain_files_give_the_network_again(crossing: ImportedMap, tmp_path:
         ("<OpenDRIVE></OpenDRIVE>", "has no roads|netconvert says"),
         ("<osm></osm>", "has no roads|netconvert says"),
         ("<osm", "netconvert says"),
+        ('<!DOCTYPE x [<!ENTITY a SYSTEM "a.xml">]><OpenDRIVE>&a;</OpenDRIVE>', "has XML entities"),
         ('<osm><relation id="1"><tag k="type" v="lanelet"/></relation></osm>', "lanelet 1 has no left or no right"),
     ],
 )
@@ -303,6 +305,45 @@ def test_openstreetmap(tmp_path: Path) -> None:
     assert "tll" in {path.name.split(".")[-2] for path in found.files}
     assert not drive(found, tmp_path)
     assert import_map(tmp_path / "map.osm.xml", tmp_path / "left", left_hand=True).left_hand
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<x>[^<]*<", "<x>nan<", "x of lanelet 1 is 'nan', not a number"),
+        ("<x>[^<]*<", "<x>1e300<", "a bound of lanelet 1 lies more than"),
+        ("<y>[^<]*</y>", "", "y of lanelet 1 is None, not a number"),
+        ('id="2"', 'id="1"', "has lanelet 1 twice"),
+        ("<rightBound>.*?</rightBound>", "<rightBound>LEFT</rightBound>", "lanelet 1 is 0.00 m wide"),
+        ("<speedLimit>12.5", "<speedLimit>fast", "a speed limit is 'fast'"),
+    ],
+)
+def test_one_line_says_which_lanelet_is_wrong(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = commonroad(tmp_path / "map.xml").read_text()
+    first = re.search("<leftBound>(.*?)</leftBound>", text)
+    assert first is not None
+    write_text(tmp_path / "map.xml", re.sub(old, new.replace("LEFT", first[1]), text, count=1))
+    with pytest.raises(InputError, match=message):
+        import_map(tmp_path / "map.xml", tmp_path / "net")
+
+
+def test_places_that_are_none_are_refused(tmp_path: Path) -> None:
+    file = lanelet2(tmp_path / "map.osm")
+    with pytest.raises(InputError, match=r"`origin` .* is no latitude and longitude"):
+        import_map(file, tmp_path / "net", origin=(100.0, 0.0))
+    text = file.read_text()
+    write_text(file, re.sub('lat="[^"]*"', 'lat="95"', text, count=1))
+    with pytest.raises(InputError, match="has nodes whose latitude or longitude is none"):
+        import_map(file, tmp_path / "net")
+    write_text(file, re.sub('<node id="-3"[^>]*>', "", text))
+    with pytest.raises(InputError, match="has ways with nodes that it lacks"):
+        import_map(file, tmp_path / "net")
+
+
+def test_a_map_of_nothing_but_a_junction_is_refused(tmp_path: Path) -> None:
+    lanelets = {1: Drawn([(0, 0), (5, 0)]), 2: Drawn([(2, -2), (2, 2)])}
+    with pytest.raises(InputError, match="all of its lanelets lie in a junction"):
+        import_map(commonroad(tmp_path / "map.xml", lanelets), tmp_path / "net")
 
 
 @pytest.mark.parametrize("name", ["7 8", 'a"b', "", "<x>"])

@@ -9,7 +9,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from tint_sumo.core.errors import InputError
-from tint_sumo.maps.lanelets import Lanelet, LaneletMap, MapFormat, Origin, bound
+from tint_sumo.maps.lanelets import Lanelet, LaneletMap, MapFormat, Origin, bound, by_id
 from tint_sumo.maps.xml_files import number, read_elements
 
 _SPEED_SIGNS = ("274", "R2-1")  # of Germany and the United States, as the format names them; values in m/s
@@ -35,7 +35,7 @@ def _read(file: Path, origin: Origin | None) -> LaneletMap:
     projection, offset_m = _location(found["location"], file)
     return LaneletMap(
         file,
-        {lanelet.id: lanelet for lanelet in lanelets},
+        by_id(lanelets, file),
         left_hand=opposite.count("adjacentRight") > opposite.count("adjacentLeft"),
         projection=projection,
         offset_m=offset_m,

@@ -13,7 +13,7 @@ from shutil import copyfileobj
 
 import sumolib
 
-from tint_sumo.core.errors import InputError, find_named, shown
+from tint_sumo.core.errors import InputError, find_named
 from tint_sumo.core.files import require_output_folder, write_text
 from tint_sumo.core.reading import TABLE_BYTES, opened
 from tint_sumo.maps import commonroad, lanelet2
@@ -27,7 +27,6 @@ PARTS = ("nod", "edg", "con", "tll")  # of plain XML
 _HEAD_BYTES = 2**16
 _CHUNK_BYTES, _TAG_BYTES = 2**20, 100
 _LANELET = re.compile(rb"""<tag\s+(k=["']type["']\s+v=["']lanelet["']|v=["']lanelet["']\s+k=["']type["'])""")
-_ID = r"[\w-]+"
 _SHOWN = 10  # lanelets in a report
 _OPTIONS = ("--offset.disable-normalization", "--no-turnarounds", "--precision", "3", "--xml-validation", "never")
 _LANELET_OPTIONS = ("--junctions.endpoint-shape",)  # roads end where their lanelets end
@@ -93,8 +92,9 @@ def import_map(
     Raises:
         InputError: the file is no map, is damaged or has no roads, netconvert refuses it, or files are there already.
     """
+    head = _head(file)
     if format_name is None:
-        format_name = find_format(file)
+        format_name = _format_of(file, head)
     find_named("format", format_name, FORMATS)
     require_output_folder(out)
     name = _name(file)
@@ -117,12 +117,27 @@ def find_format(file: Path) -> str:
     Raises:
         InputError: there is no such file, or it is none of these.
     """
+    return _format_of(file, _head(file))
+
+
+def _head(file: Path) -> str:
+    """Return the beginning of a file.
+
+    Raises:
+        InputError: there is no such file, it is empty, or it refers to other files.
+    """
     with opened(file, ROLE, TABLE_BYTES) as content:
         head = content.read(_HEAD_BYTES).decode("utf-8", "replace")
-        if not head.strip():
-            raise InputError(f"{file} is empty; give a map")
-        found = re.search(r"<(OpenDRIVE|commonRoad|osm|net|nodes|edges|fcd-export)\b", head)
-        element = found[1] if found else ""
+    if not head.strip():
+        raise InputError(f"{file} is empty; give a map")
+    if "<!ENTITY" in head:
+        raise InputError(f"{file} has XML entities, which may stand for other files; remove them")
+    return head
+
+
+def _format_of(file: Path, head: str) -> str:
+    found = re.search(r"<(OpenDRIVE|commonRoad|osm|net|nodes|edges|fcd-export)\b", head)
+    element = found[1] if found else ""
     if element == "osm":
         return "lanelet2" if _has_lanelets(file) else "osm"
     if element in ("OpenDRIVE", "commonRoad"):
@@ -162,12 +177,13 @@ def _build(file: Path, folder: Path, format_name: str, left_hand: bool | None, o
         lanelet_map = LANELET_FORMATS[format_name].read(file, origin)
         if not lanelet_map.lanelets:
             raise InputError(f"{file} has no lanelets; give a map with roads")
-        for lanelet in lanelet_map.lanelets:
-            if not re.fullmatch(_ID, lanelet):
-                raise InputError(f"{file}: {shown(lanelet)} is no id that SUMO takes for a lanelet; give it a number")
         if left_hand is not None:
             lanelet_map = replace(lanelet_map, left_hand=left_hand)
         roads = build_roads(lanelet_map)
+        if not roads.roads:
+            raise InputError(
+                f"{file} has no roads: all of its lanelets lie in a junction; give a map with its surroundings"
+            )
         texts = plain_xml(lanelet_map, roads)
         for part, text in texts.items():
             write_text(folder / f"map.{part}.xml", text)

@@ -15,7 +15,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from tint_sumo.core.errors import InputError
-from tint_sumo.maps.lanelets import Lanelet, LaneletMap, Line, MapFormat, Origin, bound
+from tint_sumo.maps.lanelets import Lanelet, LaneletMap, Line, MapFormat, Origin, bound, by_id
 from tint_sumo.maps.xml_files import number, read_elements
 
 _NOT_FOR_CARS = frozenset(
@@ -26,6 +26,7 @@ _SPEED = re.compile(r"\s*(\d+(?:\.\d*)?)\s*(km/?h|kmph|kph|mph|m/s|)\s*", re.IGN
 _UNITS_MPS = {"mph": 0.44704, "m/s": 1.0}  # others are km/h
 _NEAR_ZERO_DEG = 2.0  # INTERACTION's maps lie where the equator meets the zero meridian, which is their origin
 _ZONE_DEG = 6.0
+_MOST_DEG = np.array([180.0, 84.0])  # of longitude and latitude, as far as UTM reaches
 _Points = Mapping[str, tuple[float, float]]  # in m, by the ids of nodes
 
 
@@ -81,7 +82,7 @@ def _read(file: Path, origin: Origin | None) -> LaneletMap:
     one_way = [one for name, one in bounds.items() if _tag(roads[name], "one_way") != "no"]
     on_left = sum((one.left.way, one.left.ends[::-1]) in lefts for one in one_way)
     on_right = sum((one.right.way, one.right.ends[::-1]) in rights for one in one_way)
-    return LaneletMap(file, lanelets, on_right > on_left, projection, offset_m)
+    return LaneletMap(file, by_id(lanelets.values(), file), on_right > on_left, projection, offset_m)
 
 
 def _is_for_cars(relation: Element) -> bool:
@@ -195,6 +196,10 @@ def _positions(
     degrees = np.array([[number(node.get(key), file, key) for key in ("lon", "lat")] for node in nodes]).reshape(-1, 2)
     if not len(degrees):
         return {}, None, (0.0, 0.0)
+    if (np.abs(degrees) > _MOST_DEG).any():
+        raise InputError(f"{file} has nodes whose latitude or longitude is none; correct them")
+    if origin is not None and not (np.abs(origin) <= _MOST_DEG[::-1]).all():
+        raise InputError(f"the `origin` {origin} is no latitude and longitude in degrees; correct it")
     is_fictitious = origin is None and np.abs(degrees).max() < _NEAR_ZERO_DEG
     latitude, longitude = (0.0, 0.0) if is_fictitious else origin or tuple(degrees.mean(axis=0)[::-1])
     projection, metres = _utm(degrees, latitude, longitude)

@@ -1,6 +1,7 @@
 """Maps of lanelets, whatever their format: pieces of lanes between two bounds, and what is behind and beside them."""
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -10,11 +11,14 @@ import shapely
 from numpy.typing import NDArray
 from shapely.ops import substring
 
-from tint_sumo.core.errors import InputError
+from tint_sumo.core.errors import InputError, shown
 
 Line = NDArray[np.float64]  # (points, 2) in m
 Origin = tuple[float, float]  # latitude and longitude of x = y = 0
+_ID = r"[\w-]+"
 _SAME_POINT_M = 1e-3
+_MOST_M = 1e8  # of any coordinate; the Earth's circumference is 4e7 m
+_NARROWEST_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,26 @@ class LaneletMap:
     offset_m: tuple[float, float] = (0.0, 0.0)  # from coordinates of the projection to those of the map
 
 
+def by_id(lanelets: Iterable[Lanelet], file: Path) -> dict[str, Lanelet]:
+    """Return lanelets by their ids.
+
+    Raises:
+        InputError: an id is there twice, or none that SUMO takes, or a lanelet has no width.
+    """
+    found: dict[str, Lanelet] = {}
+    for lanelet in lanelets:
+        if not re.fullmatch(_ID, lanelet.id):
+            raise InputError(f"{file}: {shown(lanelet.id)} is no id that SUMO takes for a lanelet; give it a number")
+        if lanelet.id in found:
+            raise InputError(f"{file} has lanelet {lanelet.id} twice; keep one of them")
+        if lanelet.width_m < _NARROWEST_M:
+            raise InputError(
+                f"{file}: the bounds of lanelet {lanelet.id} are {lanelet.width_m:.2f} m apart; correct them"
+            )
+        found[lanelet.id] = lanelet
+    return found
+
+
 @dataclass(frozen=True)
 class MapFormat:
     """File format of maps of lanelets."""
@@ -76,9 +100,11 @@ def bound(points: Sequence[Sequence[float]], file: Path, lanelet: str) -> Line:
     """Return a bound without points that are there twice in a row.
 
     Raises:
-        InputError: fewer than two points are left.
+        InputError: fewer than two points are left, or they lie beyond all places on Earth.
     """
     line = np.asarray(points, np.float64).reshape(-1, 2)
+    if not (np.abs(line) <= _MOST_M).all():  # NaN, too
+        raise InputError(f"{file}: a bound of lanelet {lanelet} lies more than {_MOST_M:g} m away; correct it")
     line = line[np.r_[True, np.linalg.norm(np.diff(line, axis=0), axis=1) > _SAME_POINT_M]] if len(line) else line
     if len(line) < 2:
         raise InputError(f"{file}: a bound of lanelet {lanelet} has fewer than two points; get the file again")

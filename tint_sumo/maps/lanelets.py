@@ -80,9 +80,7 @@ def by_id(lanelets: Iterable[Lanelet], file: Path) -> dict[str, Lanelet]:
         if lanelet.id in found:
             raise InputError(f"{file} has lanelet {lanelet.id} twice; keep one of them")
         if lanelet.width_m < _NARROWEST_M:
-            raise InputError(
-                f"{file}: the bounds of lanelet {lanelet.id} are {lanelet.width_m:.2f} m apart; correct them"
-            )
+            raise InputError(f"{file}: lanelet {lanelet.id} is {lanelet.width_m:.2f} m wide; correct its bounds")
         found[lanelet.id] = lanelet
     return found
 

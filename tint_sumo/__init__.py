@@ -18,6 +18,7 @@ ENV_IDS = {
     "on_ramp": "tint_sumo/OnRamp-v0",
 }
 SCENE_ENV_ID = "tint_sumo/Scene-v0"  # the environment of any scene, which is given as ``scene``
+STRANGERS_ENV_ID = "tint_sumo/Strangers-v0"  # a scene in a world of strangers
 REPLAY_ENV_ID = "tint_sumo/Replay-v0"  # an ego among recorded vehicles
 
 
@@ -34,4 +35,5 @@ def _register(env_id: str, module: str = "envs.entry_points", prefix: str = "Gym
 for _scene, _env_id in ENV_IDS.items():
     _register(_env_id, scene=_scene)
 _register(SCENE_ENV_ID)
+_register(STRANGERS_ENV_ID, prefix="Strangers")
 _register(REPLAY_ENV_ID, "replay.env", "Replay")

@@ -591,7 +591,9 @@ class RewardPreset:
 REWARD_PRESETS = {
     "paper": RewardPreset(2.5, -2.0, 0.05, -0.0013),  # paper IV-A
     "authors": RewardPreset(2.5, -2.0, 0.05 / 3.0, -0.013),  # code
+    "careful": RewardPreset(2.5, -10.0, 0.05, -0.0013),  # the paper's, but that it is worth waiting in doubt
 }
+RewardName = Literal["paper", "authors", "careful"]
 
 
 @dataclass(frozen=True)
@@ -612,6 +614,54 @@ class TraitSettings:
 
     def __post_init__(self) -> None:
         require_ranges(self)
+
+
+@dataclass(frozen=True)
+class Steady:
+    """Limits within which a driver's motion counts as steady, so that it shows what the driver wants."""
+
+    least_speed_mps: SpeedMps = 1.5
+    greatest_accel_mps2: AccelMps2 = 0.8
+    farthest_leader_m: DistanceM = 9.0  # farther ones are not followed
+    greatest_closing_mps: SpeedMps = 0.8  # of the gap to the leader
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+
+
+@dataclass(frozen=True)
+class RelativeLatent:
+    """A weighted sum of time gap and gap, and its distribution in towns; see ``tint_sumo.traits.relative``."""
+
+    time_gap_weight: Annotated[float, Range(-1e6, 1e6)] = 7.0626  # per s
+    gap_weight: Annotated[float, Range(-1e6, 1e6)] = -1.8459  # per m
+    town_mean: Annotated[float, Range(-1e6, 1e6)] = 6.5201  # over all towns
+    town_std: Annotated[float, Range(1e-3, 1e6)] = 1.6795  # of the towns' means; the drivers of a town have 1
+    group_std: Annotated[float, Range(1e-3, 1e6)] = 0.2  # of the drivers of a group in a town
+    steps: Annotated[float, Range(1e-3, 1e6)] = 80.0  # whose mean varies as much as the drivers of a group
+    differences: Annotated[tuple[Fraction, ...], Length(1, 20)] = (
+        0.2872,
+        0.1065,
+        0.2085,
+        0.0988,
+        0.1207,
+        0.0849,
+        0.0933,
+    )
+    """Probabilities that the groups of a town differ by 0, 0.6, 1.2, ..."""
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+        if not sum(self.differences) > 0.0:
+            raise InputError("differences must have a probability above 0")
+
+
+@dataclass(frozen=True)
+class RelativeSettings:
+    """Relative traits; the default was fitted to the world ``strangers`` by ``tint-sumo traits relative``."""
+
+    latent: RelativeLatent = RelativeLatent()
+    steady: Steady = Steady()
 
 
 @dataclass(frozen=True)
@@ -656,6 +706,9 @@ class PpoSettings:
     total_steps: Decisions = 10_000_000  # paper
     policy: PolicySettings = field(default_factory=PolicySettings)
     action_repeat: Annotated[int, Range(1, 1000)] = 1  # paper: a decision every step
+    reward: RewardName = "paper"  # of the training; tests count outcomes
+    motion: bool = False  # whether the policy observes each vehicle's speed, too, as its track shows it
+    relative: RelativeSettings = field(default_factory=RelativeSettings)  # of the method "relative"
     time_limit_s: TimeS = 50.0  # limit of training episodes if the scene's is not shorter; evaluation has the scene's
 
     def __post_init__(self) -> None:
@@ -716,6 +769,7 @@ _FULL_PPO = PpoSettings(
 PPO_BUDGETS = {
     "quick": replace(_FULL_PPO, n_envs=64, total_steps=200_000),
     "full": _FULL_PPO,
+    "strangers": replace(_FULL_PPO, reward="careful", motion=True, total_steps=3_200_000),
     "paper": PpoSettings(),
 }
 

@@ -36,6 +36,7 @@ COMMAND_LINES = (
     "drivers export fitted --out drivers --size 20 --seed 3 --speed-limit 27.8",
     "drivers check fitted --recording tracks --repeats 2 --seed 3 --speed-limit 27.8 --format levelx",
     "traits train --data data --out model --method morton --budget paper --noise 0.1",
+    "traits relative --out relative.yaml --world towns --test old eidm --scene four_way --seed 3",
     "traits evaluate --data data --model vae --noise 1e-3 --other-scene",
     "traits plot --data data --model vae --out pictures",
     "traits infer --fcd data --model vae --out table.csv --vehicle-length 4.5",

@@ -22,6 +22,7 @@ WRITING = {
     "drivers fit": "drivers fit DATA --out OUT",
     "drivers export": "drivers export DATA --out OUT",
     "traits train": "traits train --data DATA --out OUT",
+    "traits relative": "traits relative --out OUT",
     "traits plot": "traits plot --data DATA --model vae --out OUT",
     "traits infer": "traits infer --fcd DATA --model vae --out OUT",
     "traits study": "traits study --out OUT",

@@ -9,6 +9,7 @@ import pytest
 
 from tests.cli.calls import run
 from tint_sumo.cli import main
+from tint_sumo.config import RelativeSettings
 
 
 def test_traits(dataset: Path, tmp_path: Path, trait_model: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -37,3 +38,16 @@ def test_traits_infer(
     assert main(["traits", "infer", "--fcd", str(dataset), "--model", "vae", "--out", str(out)]) == 0
     text = capsys.readouterr().out
     assert re.search(r"\n<?\d+\.\d% of the windows lie outside what the model was trained on\n", text)
+
+
+@pytest.mark.slow
+def test_relative_traits_are_fitted_and_become_a_budget(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "relative.yaml"
+    assert main(["traits", "relative", "--world", "towns", "--test", "old", "--out", str(out), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert 0.9 < found["worlds"]["old"]["accuracy"] < 1.0 and found["worlds"]["old"]["brier"] < 0.08
+    weight = found["settings"]["latent"]["time_gap_weight"]
+    assert weight != RelativeSettings().latent.time_gap_weight
+    train = ["policy", "train", "--method", "relative", "--config", str(out), "--out", "run"]
+    assert main([*train, "--print-config"]) == 0
+    assert f"time_gap_weight: {weight}" in capsys.readouterr().out

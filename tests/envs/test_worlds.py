@@ -1,9 +1,15 @@
 """Worlds of drivers and sensors."""
 
+from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
+from tint_sumo import STRANGERS_ENV_ID
 from tint_sumo.config import (
     HELD_OUT_WORLDS,
     POPULATIONS,
@@ -51,3 +57,41 @@ def test_a_test_has_one_sensor_and_a_world_one_name() -> None:
         task_in(find_world("strangers"), TaskSettings())
     with pytest.raises(InputError, match=r"unknown world 'moon'; choose one of: old, strangers"):
         find_world("moon")
+
+
+def test_the_environment_of_strangers_is_a_scene_in_a_world() -> None:
+    with (
+        closing(gymnasium.make(STRANGERS_ENV_ID, p_conservative=0.5, time_limit_s=2.0)) as strangers,
+        closing(gymnasium.make(STRANGERS_ENV_ID, p_conservative=0.5, time_limit_s=2.0, world="acc")) as others,
+    ):
+        check_env(strangers.unwrapped, skip_render_check=True)
+        assert strangers.unwrapped._settings.reward == "careful"  # type: ignore[attr-defined]
+        town = {strangers.reset(seed=seed)[1]["town"] for seed in range(8)}
+        assert len(town) > 4 and min(town) >= 0
+        assert others.unwrapped._settings == task_in(  # type: ignore[attr-defined]
+            find_world("acc"), TaskSettings(p_conservative=Mix(0.5), time_limit_s=2.0, reward="careful")
+        )
+
+
+def test_environments_of_strangers_share_the_sensors_of_their_world() -> None:
+    with closing(gymnasium.make_vec(STRANGERS_ENV_ID, num_envs=9, world="strangers", time_limit_s=2.0)) as vector:
+        observation, _ = vector.reset(seed=3)
+        with closing(gymnasium.make_vec(STRANGERS_ENV_ID, num_envs=9, time_limit_s=2.0)) as perfect:
+            plain, _ = perfect.reset(seed=3)
+    seen = [np.array_equal(one, other) for one, other in zip(observation["vehicles"], plain["vehicles"], strict=True)]
+    assert seen[0] and not all(seen)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"world": "moon"}, "unknown world 'moon'"),
+        ({"world": "strangers"}, "are for training, and a test has one sensor"),
+        ({"tau_s": 1.0}, "tau_s: the world has that; leave it out, or give another `world`"),
+        ({"position_noise_m": 0.1}, "position_noise_m: the world has that"),
+        ({"towns": 3}, "towns"),
+    ],
+)
+def test_arguments_that_a_world_has_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        gymnasium.make(STRANGERS_ENV_ID, **arguments)

@@ -6,19 +6,23 @@ import pytest
 import torch
 from gymnasium import spaces
 
+from tint_sumo.config import RelativeLatent, RelativeSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.windows import cut_windows
 from tint_sumo.policy.trait_sources import (
     ClassifierTraits,
     EncoderTraits,
+    NeighbourTraits,
     NoTraits,
     OracleTraits,
     StreamingTraits,
     TraitSource,
+    WithMotion,
 )
 from tint_sumo.policy.wrappers import TRUE_TRAITS, TraitObservation
 from tint_sumo.traits import load
 from tint_sumo.traits.evaluation import encode_windows
+from tint_sumo.traits.relative import RelativeStream
 from tint_sumo.traits.streaming import fuse_so_far
 
 from .tasks import STREET, FakeVecEnv, Memory
@@ -335,3 +339,46 @@ def test_true_traits_beside_inferred_ones() -> None:
     assert observation[TRUE_TRAITS][0, 3].tolist() == [0.0, 1.0]  # type: ignore[call-overload]
     assert infos[0]["terminal_observation"][TRUE_TRAITS][3].tolist() == [0.0, 1.0]
     assert infos[0]["terminal_observation"]["traits"].shape == (12, 5)
+
+
+def test_relative_traits_are_those_of_the_stream_and_begin_anew_with_each_episode() -> None:
+    settings = RelativeSettings(RelativeLatent(0.0, 1.0, 5.0, 1.0, 0.2, 1.0))
+    first = [{slot: Seen(10.0 + 0.2 * k, gap_m) for slot, gap_m in ((0, 6.0), (3, 4.0), (4, 4.0))} for k in range(16)]
+    second = [{0: Seen(5.0 + 0.2 * k, 4.0), 1: Seen(0.2 * k, 6.0)} for k in range(16)]
+    traits, infos = play([[first, second]], NeighbourTraits(settings), 26)
+
+    def expected(episode: list[Scene]) -> list[np.ndarray]:
+        stream, found = RelativeStream(settings, 1, 12), []
+        stream.begin(np.array([0]))
+        for scene in episode:
+            present, position_m, gap_m = np.zeros((1, 12), bool), np.zeros((1, 12)), np.full((1, 12), np.inf)
+            for slot, seen in scene.items():
+                present[0, slot], position_m[0, slot], gap_m[0, slot] = True, seen.position_m, seen.gap_m
+            found.append(stream.advance(np.arange(1), present, position_m, gap_m)[0])
+        return found
+
+    assert traits[14, 0, 0, 0] > 0.2 > -0.2 > traits[14, 0, 3, 0]
+    assert traits[24, 0, 1, 0] > 0.2 > -0.2 > traits[24, 0, 0, 0]
+    np.testing.assert_array_equal(traits[:15, 0], expected(first)[:15])
+    np.testing.assert_array_equal(infos[14][0]["terminal_observation"]["traits"], expected(first)[15])
+    np.testing.assert_array_equal(traits[15:, 0], expected(second)[: len(traits) - 15])
+
+
+def test_motion_stands_before_the_traits_and_begins_anew_with_each_vehicle() -> None:
+    """Slot 3 drives at 2 m/s and then at 1 m/s; slot 5 leaves, and another vehicle comes to it."""
+    speeds = [2.0] * 8 + [1.0] * 8
+    along_m = 15.0 + 0.1 * np.cumsum(speeds)
+    scenes = [{3: Seen(float(position_m), 8.0), 5: Seen(10.0 + 0.3 * k)} for k, position_m in enumerate(along_m)]
+    del scenes[10][5]
+    for k in range(11, 16):
+        scenes[k][5] = Seen(1.0 + 0.1 * k, 30.0)
+    traits, _ = play([[scenes]], WithMotion(OracleTraits()), 14)
+    assert traits.shape[-1] == 5
+    np.testing.assert_array_equal(traits[:, 0, 3, 3:], [[0.0, 1.0]] * 15)
+    np.testing.assert_allclose(traits[:, 0, 3, 2], 0.8, rtol=1e-6)
+    assert not traits[0, 0, 3, :2].any()
+    np.testing.assert_allclose(traits[1:8, 0, 3, :2], [[2.0 / 3.0, 0.0]] * 7, atol=1e-5)
+    assert 1.0 / 3.0 < traits[9, 0, 3, 0] < 0.6 and traits[9, 0, 3, 1] < -0.3
+    np.testing.assert_allclose(traits[14, 0, 3, 0], 1.0 / 3.0, atol=0.05)
+    assert not traits[10, 0, 5].any() and not traits[11, 0, 5, :2].any()
+    np.testing.assert_allclose(traits[12:, 0, 5, :3], [[1.0 / 3.0, 0.0, 2.0]] * 3, atol=1e-5)

@@ -5,25 +5,29 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from tyro.conf import subcommand
+from tyro.conf import arg, subcommand
 
 from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, names_in, use_one_thread, wrote
 from tint_sumo.cli.values import (
+    SCENES,
     TRAIT_BUDGET,
     TRAIT_STUDY,
     FolderOrUrl,
+    SceneValue,
     TestData,
     TraitBudgetValue,
     TraitModelName,
     TraitStudyValue,
     optional,
 )
-from tint_sumo.config import NoiseM, Seed
+from tint_sumo.config import WORLDS, NoiseM, Seed
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.files import require_output_file, require_output_folder
+from tint_sumo.core.files import require_output_file, require_output_folder, write_text
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.ranges import Processes, Range
 from tint_sumo.core.stores import working_folder
+from tint_sumo.core.structures import plain
+from tint_sumo.core.yaml_files import to_yaml
 
 _NOISE = optional(
     "FLOAT", "Standard deviation of the noise on every position in training, m.", "the budget's, 0 in named budgets"
@@ -81,6 +85,41 @@ class TrainTraits(Command):
         return Outcome(
             f"trained {self.method} on {card['windows']} windows: {self.out}", {**card, "out": str(self.out)}
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitRelative(Command):
+    """Fit relative traits to simulated traffic, without labels, and measure how well they tell who yields."""
+
+    out: Path
+    """YAML file for them, for `tint-sumo policy train --method relative --config FILE`."""
+    world: Annotated[str, arg(help=f"World to fit to: {', '.join(WORLDS)}.")] = "strangers"
+    test: Annotated[tuple[str, ...], arg(metavar="WORLD [WORLD ...]")] = ("old", "towns")
+    """Worlds to measure in, in other traffic."""
+    scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}.")] = "t_intersection"
+    seed: Annotated[int, Range(0, 1_000_000)] = 0
+    """Seed of the traffic."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.traits.relative_fit import fit_relative, traffic_in
+        from tint_sumo.traits.relative_reading import beliefs
+
+        require_output_file(self.out, (".yaml", ".yml"))
+        use_one_thread()
+        settings = fit_relative(traffic_in(self.world, self.scene, 2 * self.seed))
+        found = {name: beliefs(settings, traffic_in(name, self.scene, 2 * self.seed + 1)) for name in self.test}
+        scores = {
+            name: {"accuracy": one.accuracy, "brier": one.brier, "calibration_error": one.calibration_error}
+            for name, one in found.items()
+        }
+        values = {"budget": {"base": "strangers", "relative": plain(settings)}}
+        write_text(self.out, to_yaml(values, {"budget": f"Relative traits, fitted to the world {self.world}."}))
+        lines = [
+            f"{name:16} {percent(one['accuracy'], 3):>7}% right, Brier score {one['brier']:.3f}, "
+            f"calibration error {percent(one['calibration_error'], 3)}%"
+            for name, one in scores.items()
+        ]
+        return Outcome("\n".join([*lines, *wrote([str(self.out)])]), {"settings": plain(settings), "worlds": scores})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,6 +244,7 @@ class Traits:
 
     command: (
         Annotated[TrainTraits, subcommand("train")]
+        | Annotated[FitRelative, subcommand("relative")]
         | Annotated[EvaluateTraits, subcommand("evaluate")]
         | Annotated[PlotTraits, subcommand("plot")]
         | Annotated[InferTraits, subcommand("infer")]

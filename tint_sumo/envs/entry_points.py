@@ -18,8 +18,10 @@ from tint_sumo.core.structures import require_fields
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.scene_env import SceneEnv
 from tint_sumo.envs.vector import SceneVectorEnv
+from tint_sumo.envs.worlds import find_world, task_in, tasks_in
 
 _NOISE = "position_noise_m"  # shorthand for a sensor that has this noise alone
+_OF_THE_WORLD = ("sensor", "tau_s")
 
 
 class GymnasiumEnv(SceneEnv):
@@ -47,6 +49,55 @@ class GymnasiumVectorEnv(SceneVectorEnv):
             super().__init__(num_envs, each, render_mode, workers, autoreset_mode)
         else:
             super().__init__(num_envs, TaskSettings(**task), render_mode, workers, autoreset_mode)
+
+
+class StrangersEnv(SceneEnv):
+    """A scene in a world: drivers of unseen towns, seen through a sensor; the benchmark of driving among strangers.
+
+    ## Description
+    ``SceneEnv`` in one of ``tint_sumo.config.WORLDS``, by default among the drivers of 128 towns. Each episode is in
+    one town. Its drivers keep headways, speeds and gaps of their own, and those who yield differ from those who do not
+    by as much as the town has it, so that who yields shows only in comparison with the neighbours, if at all. Spaces,
+    episodes and info are those of ``SceneEnv``; a collision costs 10 by default (``reward="careful"``).
+
+    ## Arguments
+    world: name of the world; one with several sensors is for ``gymnasium.make_vec`` alone. All other arguments are
+    those of ``SceneEnv`` but ``sensor``, ``position_noise_m`` and ``tau_s``, which the world has.
+
+    ## Version History
+    v0: first version.
+    """
+
+    def __init__(self, render_mode: str | None = None, world: str = "towns", **task: Any) -> None:
+        super().__init__(task_in(find_world(world), _stranger_task(StrangersEnv, task)), render_mode)
+
+
+class StrangersVectorEnv(SceneVectorEnv):
+    """Several of ``StrangersEnv``; in a world with several sensors each has an equal share of them."""
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        workers: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        world: str = "towns",
+        **task: Any,
+    ) -> None:
+        tasks = tasks_in(find_world(world), _stranger_task(StrangersVectorEnv, task))
+        super().__init__(num_envs, tasks, render_mode, workers, autoreset_mode)
+
+
+def _stranger_task(entry_point: type, task: Mapping[str, Any]) -> TaskSettings:
+    """Return the settings that the further arguments of an environment among strangers give.
+
+    Raises:
+        InputError: there is no argument of some name, or the world has it.
+    """
+    given = [name for name in (*_OF_THE_WORLD, _NOISE) if name in task]
+    if given:
+        raise InputError(f"{', '.join(given)}: the world has that; leave it out, or give another `world`")
+    return TaskSettings(**{"reward": "careful", **known_arguments(entry_point, task, without=_OF_THE_WORLD)})
 
 
 def known_arguments(

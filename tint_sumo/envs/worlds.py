@@ -28,6 +28,16 @@ def scene_in(world: World, scene: AnyScene) -> Scene:
     return replace(built_in, population=population if world.tau_s is None else population.with_tau(world.tau_s))
 
 
+def tasks_in(world: World, task: TaskSettings) -> list[TaskSettings]:
+    """Return settings of environments in a world, one for each of its sensors, with all else as in ``task``.
+
+    Raises:
+        InputError: the scene is a SUMO configuration.
+    """
+    scene = scene_in(world, task.scene)
+    return [replace(task, scene=scene, sensor=sensor) for sensor in world.sensors]
+
+
 def task_in(world: World, task: TaskSettings) -> TaskSettings:
     """Return settings of environments in a world, with all else as in ``task``.
 
@@ -36,4 +46,4 @@ def task_in(world: World, task: TaskSettings) -> TaskSettings:
     """
     if len(world.sensors) > 1:
         raise InputError(f"{world.title} are for training, and a test has one sensor; give another world")
-    return replace(task, scene=scene_in(world, task.scene), sensor=world.sensors[0])
+    return tasks_in(world, task)[0]

@@ -9,7 +9,7 @@ from sklearn.linear_model import LogisticRegression
 from tint_sumo.config import CONSERVATIVE_LABEL, LATENT_SIZE, Mix
 from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.loading import Contender
-from tint_sumo.policy.trait_sources import StreamingTraits
+from tint_sumo.policy.trait_sources import StreamingTraits, WithMotion
 from tint_sumo.scenes.geometry import Floats
 
 _ENVS, _STEPS = 8, 200  # environments and steps of the observed traffic
@@ -29,10 +29,11 @@ class TraitReader:
     weights: Floats  # (D,) of the first numbers of each driver
     bias: float
     has_spread: bool  # whether the numbers that follow are the first ones' standard deviations
+    before: int = 0  # numbers of each driver's motion, which come before its traits
 
     def p_conservative(self, observed: Floats) -> Floats:
         """Return probabilities (...) of conservative drivers, from observed traits (..., Z); NaN where all are 0."""
-        size = len(self.weights)
+        size, observed = len(self.weights), observed[..., self.before :]
         logit = observed[..., :size] @ self.weights + self.bias
         if self.has_spread:
             variance = (observed[..., size : 2 * size] * self.weights) ** 2
@@ -45,15 +46,18 @@ def fit_reader(contender: Contender) -> TraitReader | None:
     """Return a reader fitted to some seconds of other traffic; None if the observation has no traits, or one alone."""
     if contender.source is None:
         return None
+    source = contender.source()
+    before, source = (source.before, source.inner) if isinstance(source, WithMotion) else (0, source)
     observed, traits = _look_at_traffic(contender)
+    observed = observed[:, before:]
     known = observed.any(axis=-1)
     is_conservative = traits[known] == CONSERVATIVE_LABEL
     if len(np.unique(is_conservative)) < 2:
         return None
-    has_spread = isinstance(contender.source(), StreamingTraits)
+    has_spread = isinstance(source, StreamingTraits)
     inputs = observed[known][:, :LATENT_SIZE] if has_spread else observed[known]
     line = LogisticRegression(C=10.0).fit(inputs, is_conservative)
-    return TraitReader(line.coef_[0], float(line.intercept_[0]), has_spread)
+    return TraitReader(line.coef_[0], float(line.intercept_[0]), has_spread, before)
 
 
 def _look_at_traffic(contender: Contender) -> tuple[Floats, Floats]:

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits
-from tint_sumo.config import LATENT_SIZE, PERFECT, Mix, Sensor, Traffic
+from tint_sumo.config import LATENT_SIZE, PERFECT, Mix, PpoSettings, Sensor, Traffic
 from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import InputError, NotFiniteError
 from tint_sumo.core.files import shipped
@@ -153,11 +153,12 @@ def _contender(stem: Path, policy: GruPolicy | RecurrentPPO) -> Contender:
     _require_finite(stem, policy if isinstance(policy, GruPolicy) else policy.policy)
     learned = find_learned(card["method"])
     encoder = None if learned.encoder is None else _load_encoder(stem, card)
+    observed = _observation_settings(card["settings"])
     return Contender(
         stem.name,
         policy,
         read_described(card)[0],
-        lambda: learned.make_source(encoder),
+        lambda: learned.make_source(encoder, observed),
         None if card["p_conservative"] is None else Mix.parse(card["p_conservative"]),
         build(Sensor, card.get("sensor", {}), ("sensor",)),
         int(card["settings"]["action_repeat"]),
@@ -232,11 +233,31 @@ def _checked_card(stem: Path) -> dict[str, Any]:
     mix = card.get("p_conservative")
     fits = isinstance(method, Learned) and (_is_mix(mix) or (mix is None and "scene_settings" in card))
     fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
+    fits &= isinstance(settings, dict) and _is_observation(settings)
     fits &= "scene_settings" in card or str(card.get("scene")) in (*SCENES, ALL_SCENES)
     fits &= _is_sensor(card.get("sensor", {}))
     if not fits or (isinstance(method, Learned) and method.encoder and not _is_file_name(card.get("traits"))):
         raise InputError(f"{card_file(stem)} is not the card of a policy; restore the file or train the policy again")
     return card
+
+
+def _observation_settings(settings: dict[str, Any]) -> PpoSettings:
+    """Return settings with those of a card that say what the policy observes; older cards have none of them.
+
+    Raises:
+        FieldError: they make no sense.
+    """
+    found = {name: settings[name] for name in ("motion", "relative") if name in settings}
+    observed: PpoSettings = build(PpoSettings, found)
+    return observed
+
+
+def _is_observation(settings: dict[str, Any]) -> bool:
+    try:
+        _observation_settings(settings)
+    except FieldError:
+        return False
+    return True
 
 
 def _is_mix(value: object) -> bool:

@@ -79,10 +79,11 @@ class Learned:
 
     name: str
     title: str
-    source: "Callable[..., TraitSource]"  # takes the trait model if there is one
+    source: "Callable[..., TraitSource]"  # takes the trait model if there is one, else the settings of PPO
     encoder: str | None = None  # trait method (``tint_sumo.traits.TRAIT_METHODS``) whose model it needs
     attention: bool = True
     critic_sees_true_traits: bool = False  # only in training; the policy itself never sees them
+    world: str = "old"  # the world whose study it belongs to
     trained_as: str | None = None  # the method whose training it shares, if it drives with other traits than it learnt
     look: Look = Look()
 
@@ -91,9 +92,12 @@ class Learned:
         """Whether its training does."""
         return self.source is true_traits or self.critic_sees_true_traits or self.trained_as is not None
 
-    def make_source(self, encoder: "TraitModel | None") -> "TraitSource":
-        """Return a new source of traits."""
-        return self.source() if encoder is None else self.source(encoder)
+    def make_source(self, encoder: "TraitModel | None", settings: PpoSettings) -> "TraitSource":
+        """Return a new source of what the settings let the policy observe of the vehicles beside their positions."""
+        from tint_sumo.policy.trait_sources import WithMotion
+
+        source = self.source(settings) if encoder is None else self.source(encoder)
+        return WithMotion(source) if settings.motion else source
 
     def settings_of(self, settings: PpoSettings) -> PpoSettings:
         """Return settings of PPO with the network of this method.
@@ -154,8 +158,12 @@ def learned_methods() -> tuple[str, ...]:
 
 
 def built_in_methods() -> tuple[str, ...]:
-    """Return the names of all methods that can drive in built-in scenes."""
-    return tuple(name for name, one in METHODS.items() if isinstance(one, Learned) or one.ego_control == "speed")
+    """Return the names of the methods of the study, which drive in built-in scenes and learn in the old world."""
+    return tuple(
+        name
+        for name, one in METHODS.items()
+        if (one.world == "old" if isinstance(one, Learned) else one.ego_control == "speed")
+    )
 
 
 def needed_encoders() -> tuple[str, ...]:
@@ -203,7 +211,7 @@ def time_to_collision(scene: "AnyScene") -> Policy:
     )
 
 
-def no_traits() -> "TraitSource":
+def no_traits(_: PpoSettings) -> "TraitSource":
     from tint_sumo.policy.trait_sources import NoTraits
 
     return NoTraits()
@@ -227,7 +235,13 @@ def streaming_traits(model: "TraitModel") -> "TraitSource":
     return StreamingTraits(model)
 
 
-def true_traits() -> "TraitSource":
+def neighbour_traits(settings: PpoSettings) -> "TraitSource":
+    from tint_sumo.policy.trait_sources import NeighbourTraits
+
+    return NeighbourTraits(settings.relative)
+
+
+def true_traits(_: PpoSettings) -> "TraitSource":
     from tint_sumo.policy.trait_sources import OracleTraits
 
     return OracleTraits()
@@ -261,6 +275,7 @@ register(
         look=Look("#fc329e", "h", "-."),
     )
 )
+register(Learned("relative", "relative traits", neighbour_traits, world="strangers", look=Look("#007700", "d", "-")))
 register(
     Learned("ma", "Ma", classified_traits, encoder="classifier", trained_as="oracle", look=Look("#15a1bb", "<", "--"))
 )

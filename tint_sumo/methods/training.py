@@ -203,7 +203,7 @@ def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | N
     if learned.encoder is None:
         return None
     encoder = trait_models.load(traits or learned.encoder, latent_size=LATENT_SIZE)
-    learned.make_source(encoder)  # refuses a model of another method where it needs one of its own
+    learned.make_source(encoder, PpoSettings())  # refuses a model of another method where it needs one of its own
     return encoder
 
 
@@ -220,9 +220,9 @@ def training_venv(
     shown = learned if learned.trained_as is None else find_learned(learned.trained_as)
     return policy_venv(
         settings.n_envs,
-        shown.make_source(encoder if shown.encoder else None),
+        shown.make_source(encoder if shown.encoder else None, settings),
         [
-            TaskSettings(scene, p_conservative, time_limit_s=time_limit_s, sensor=sensor)
+            TaskSettings(scene, p_conservative, settings.reward, time_limit_s, sensor)
             for scene in scenes
             for sensor in sensors
         ],

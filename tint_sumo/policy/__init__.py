@@ -5,10 +5,12 @@ from tint_sumo.policy.ppo import RecurrentPPO
 from tint_sumo.policy.trait_sources import (
     ClassifierTraits,
     EncoderTraits,
+    NeighbourTraits,
     NoTraits,
     OracleTraits,
     StreamingTraits,
     TraitSource,
+    WithMotion,
 )
 from tint_sumo.policy.wrappers import ActionRepeat, TraitObservation
 
@@ -18,10 +20,12 @@ __all__ = [
     "ClassifierTraits",
     "EncoderTraits",
     "GruPolicy",
+    "NeighbourTraits",
     "NoTraits",
     "OracleTraits",
     "RecurrentPPO",
     "StreamingTraits",
     "TraitObservation",
     "TraitSource",
+    "WithMotion",
 ]

@@ -7,16 +7,28 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import torch
 
-from tint_sumo.config import KINDS, LATENT_SIZE, STEP_S, WINDOW_STEPS
+from tint_sumo.config import (
+    KINDS,
+    LATENT_SIZE,
+    NO_LEADER_GAP_M,
+    SPEED_SCALE_MPS,
+    STEP_S,
+    WINDOW_STEPS,
+    RelativeSettings,
+)
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.windows import cut_windows
 from tint_sumo.traits.classifier import Classifier
 from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.model import TraitModel
+from tint_sumo.traits.relative import LATENTS, RelativeStream
 from tint_sumo.traits.streaming import TrackStream
 
 Observation = dict[str, np.ndarray]
 _AGE_SCALE_S = 10.0  # a vehicle crosses the street in 15 to 20 s
+_MOTION = 3  # numbers
+_SPEED_STEPS, _MEAN_STEPS = 3, 12  # of moving averages
+_GAP_SCALE_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -238,6 +250,96 @@ class StreamingTraits(TraitSource):
         self.traits[envs] = 0.0
         rows, slots = np.nonzero(present)
         self.traits[envs[rows], slots] = np.concatenate([mean, std, age[:, None]], axis=-1)
+
+
+class NeighbourTraits(TraitSource):
+    """Traits inferred from how a vehicle and all others in the episode follow their leaders.
+
+    A vehicle's two numbers are those of ``tint_sumo.traits.relative.RelativeStream``.
+    """
+
+    size = LATENTS
+    needs_tracks = True
+
+    def __init__(self, settings: RelativeSettings) -> None:
+        self.settings = settings
+
+    def attach(self, num_envs: int, max_vehicles: int) -> None:
+        super().attach(num_envs, max_vehicles)
+        self._stream = RelativeStream(self.settings, num_envs, max_vehicles)
+
+    def memory(self) -> dict[str, Any]:
+        return {**super().memory(), **{f"stream_{name}": part for name, part in self._stream.memory().items()}}
+
+    def begin(self, frame: Frame) -> None:
+        envs = np.flatnonzero(frame.done)
+        self._stream.begin(envs)
+        self._follow(frame, envs)
+
+    def advance(self, frame: Frame) -> None:
+        self._follow(frame, np.arange(len(frame.done)))
+
+    def _follow(self, frame: Frame, envs: np.ndarray) -> None:
+        """Take one more step of the tracks in some environments."""
+        position_m, gap_m = (frame.slots[key][envs].astype(np.float64) for key in ("position_m", "gap_m"))
+        self.traits[envs] = self._stream.advance(envs, frame.present[envs], position_m, gap_m)
+
+
+class WithMotion(TraitSource):
+    """The traits of another source, behind the motion of each vehicle as its track shows it.
+
+    Three numbers stand for the motion, all zero in empty slots: its speed, in units of 3 m/s, as a moving average over
+    about 0.3 s; how much that exceeds the average over about 1.2 s, in m/s; and the gap to its leader, in units of 10 m
+    and 20 m at most. Without them, the policy's network would have to find the speeds of up to 12 vehicles in the
+    differences of their positions from decision to decision.
+    """
+
+    needs_tracks = True
+    before = _MOTION  # numbers before the traits
+
+    def __init__(self, inner: TraitSource) -> None:
+        self.inner = inner
+        self.size = _MOTION + inner.size
+
+    def attach(self, num_envs: int, max_vehicles: int) -> None:
+        super().attach(num_envs, max_vehicles)
+        self.inner.attach(num_envs, max_vehicles)
+        shape = (num_envs, max_vehicles)
+        self._steps = np.zeros(shape, np.int64)  # for which the present vehicle has been seen
+        self._position_m, self._speed_mps, self._mean_mps = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+
+    def memory(self) -> dict[str, Any]:
+        own = {"steps": self._steps, "position_m": self._position_m}
+        own |= {"speed_mps": self._speed_mps, "mean_mps": self._mean_mps, "traits": self.traits}
+        return {**{f"inner_{name}": part for name, part in self.inner.memory().items()}, **own}
+
+    def begin(self, frame: Frame) -> None:
+        self.inner.begin(frame)
+        self._steps[frame.done] = 0
+        self._follow(frame, np.flatnonzero(frame.done))
+
+    def advance(self, frame: Frame) -> None:
+        self.inner.advance(frame)
+        self._follow(frame, np.arange(len(frame.done)))
+
+    def _follow(self, frame: Frame, envs: np.ndarray) -> None:
+        present, position_m = frame.present[envs], frame.slots["position_m"][envs]
+        steps = np.where(present, self._steps[envs] + 1, 0)
+        speed_mps = (position_m - self._position_m[envs]) / STEP_S
+        self._speed_mps[envs] = _moving_average(self._speed_mps[envs], speed_mps, steps, _SPEED_STEPS)
+        self._mean_mps[envs] = _moving_average(self._mean_mps[envs], speed_mps, steps, _MEAN_STEPS)
+        self._steps[envs], self._position_m[envs] = steps, position_m
+        gap_m = np.minimum(frame.slots["gap_m"][envs], NO_LEADER_GAP_M)
+        more_mps = self._speed_mps[envs] - self._mean_mps[envs]
+        motion = np.stack([self._speed_mps[envs] / SPEED_SCALE_MPS, more_mps, gap_m / _GAP_SCALE_M], axis=-1)
+        self.traits[envs, :, :_MOTION] = np.where(present[..., None], motion, 0.0)
+        self.traits[envs, :, _MOTION:] = self.inner.traits[envs]
+
+
+def _moving_average(before: np.ndarray, value: np.ndarray, steps: np.ndarray, length: int) -> np.ndarray:
+    """Return the mean over the first steps, then an exponential moving average; 0 until the second step of a track."""
+    weight = 1.0 / np.clip(steps - 1, 1, length)
+    return np.where(steps > 1, before + weight * (value - before), 0.0)
 
 
 def _require_latent_size(model: Encoder) -> None:

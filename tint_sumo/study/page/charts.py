@@ -15,8 +15,9 @@ from tint_sumo.study.tables import Lines
 
 # Plotly's names for Matplotlib's markers and line styles.
 _SYMBOLS = {
-    **{"o": "circle", "s": "square", "D": "diamond", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left"},
-    **{">": "triangle-right", "P": "cross", "X": "x", "*": "star", "h": "hexagon", "p": "pentagon"},
+    **{"o": "circle", "s": "square", "D": "diamond", "d": "diamond-tall", "^": "triangle-up", "v": "triangle-down"},
+    **{"<": "triangle-left", ">": "triangle-right", "P": "cross", "X": "x", "*": "star", "h": "hexagon"},
+    "p": "pentagon",
 }
 _DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
 # Mixes are no methods: all have the same colour, and different markers.

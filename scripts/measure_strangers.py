@@ -1,0 +1,72 @@
+"""Test policies in worlds that their training has not met; writes a table.
+
+Usage: python scripts/measure_strangers.py RUNS [--cases 300] [--out data/results/strangers.csv]
+
+RUNS is a folder of training runs METHOD.SEED, such as ``tint-sumo policy train --method oracle --world towns --budget
+strangers --seed 0 --out RUNS/oracle.0`` makes. A row of the table is a policy in a world; the rules and the shipped
+policies of the old world stand there, too. Rows that an earlier, interrupted call has written are kept.
+"""
+
+import argparse
+import csv
+import io
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from tint_sumo.config import ALL_MIXES, HELD_OUT_WORLDS
+from tint_sumo.core.determinism import single_threaded
+from tint_sumo.core.files import write_text
+from tint_sumo.envs.worlds import find_world, task_in
+from tint_sumo.methods.evaluation import BUILT_IN_OUTCOMES, evaluate
+from tint_sumo.methods.loading import Contender, load_policy
+
+WORLDS = ("old", "towns", *HELD_OUT_WORLDS)
+OTHERS = ("always_go", "ttc", "no_labels", "cross_window", "oracle")  # rules and policies of the old world
+CASE_SET = 600
+FIELDS = ("trained_in", "method", "seed", "world", "cases", *(f"{outcome}_percent" for outcome in BUILT_IN_OUTCOMES))
+
+
+def contenders(runs: Path) -> Iterator[tuple[str, str, str]]:
+    """Yield the world of the training, the name of the method, and name or path of each policy; with its seed last."""
+    for name in OTHERS:
+        yield "" if name in ("always_go", "ttc") else "old", name, name
+    for folder in sorted(runs.iterdir()):
+        if (folder / "policy.safetensors").exists():
+            yield "towns", folder.name.split(".")[0], str(folder)
+
+
+def measure(contender: Contender, world: str, cases: int) -> dict[str, str]:
+    task = task_in(find_world(world), replace(contender.task, p_conservative=ALL_MIXES))
+    found = evaluate(contender.policy, lambda count: contender.make_venv(count, task), cases, CASE_SET)
+    return {f"{outcome}_percent": f"{100 * found.rate(outcome).value:.1f}" for outcome in BUILT_IN_OUTCOMES}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("runs", type=Path)
+    parser.add_argument("--cases", type=int, default=300)
+    parser.add_argument("--out", type=Path, default=Path("data/results/strangers.csv"))
+    given = parser.parse_args()
+    rows = list(csv.DictReader(given.out.read_text().splitlines())) if given.out.exists() else []
+    known = {(row["trained_in"], row["method"], row["seed"], row["world"], row["cases"]) for row in rows}
+    with single_threaded():
+        for trained_in, method, name in contenders(given.runs):
+            contender = load_policy(name)
+            for world in WORLDS:
+                seed = Path(name).suffix[1:]
+                key = (trained_in, method, seed, world, str(given.cases))
+                if key in known:
+                    continue
+                rows.append(dict(zip(FIELDS, key, strict=False)) | measure(contender, world, given.cases))
+                print(*rows[-1].values(), flush=True)
+                text = io.StringIO()
+                writer = csv.DictWriter(text, FIELDS, lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(rows)
+                write_text(given.out, text.getvalue())
+    print(f"wrote {given.out}")
+
+
+if __name__ == "__main__":
+    main()

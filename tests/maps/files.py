@@ -23,7 +23,7 @@ class Drawn:
     left: int | None = None
     right: int | None = None
     sign: str | None = None
-    has_light: bool = False
+    light: int | None = None
     bounds: tuple[np.ndarray, np.ndarray] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -56,14 +56,26 @@ CROSSING = {
 }
 
 
-def commonroad(file: Path, lanelets: Mapping[int, Drawn] = CROSSING) -> Path:
+def commonroad(file: Path, lanelets: Mapping[int, Drawn] = CROSSING, lights: str = "") -> Path:
     signs = sorted({one.sign for one in lanelets.values() if one.sign})
     body = "".join(_commonroad_lanelet(name, one) for name, one in lanelets.items())
     for sign in signs:
         element = f"<trafficSignElement><trafficSignID>{sign}</trafficSignID></trafficSignElement>"
         body += f'<trafficSign id="9{sign}">{element}</trafficSign>'
-    write_text(file, f'<?xml version="1.0"?><commonRoad timeStepSize="0.1" benchmarkID="X">{body}</commonRoad>')
+    write_text(file, f'<?xml version="1.0"?><commonRoad timeStepSize="0.1" benchmarkID="X">{body}{lights}</commonRoad>')
     return file
+
+
+def traffic_light(name: int, steps: Sequence[tuple[int, str]], offset: int, active: bool = True) -> str:
+    """A traffic light of CommonRoad with durations in time steps."""
+    cycle = "".join(
+        f"<cycleElement><duration>{duration}</duration><color>{colour}</color></cycleElement>"
+        for duration, colour in steps
+    )
+    return (
+        f'<trafficLight id="{name}"><cycle>{cycle}<timeOffset>{offset}</timeOffset></cycle>'
+        f"<active>{str(active).lower()}</active></trafficLight>"
+    )
 
 
 def _commonroad_lanelet(name: int, one: Drawn) -> str:
@@ -78,7 +90,7 @@ def _commonroad_lanelet(name: int, one: Drawn) -> str:
     )
     after = "".join(f'<successor ref="{other}"/>' for other in one.successors)
     sign = f'<trafficSignRef ref="9{one.sign}"/>' if one.sign else ""
-    light = '<trafficLightRef ref="7"/>' if one.has_light else ""
+    light = f'<trafficLightRef ref="{one.light}"/>' if one.light else ""
     return f'<lanelet id="{name}">{left}{right}{after}{beside}<speedLimit>12.5</speedLimit>{sign}{light}</lanelet>'
 
 

@@ -15,7 +15,7 @@ import pytest
 import shapely
 import sumolib
 
-from tests.maps.files import CROSSING, PRIORITY, STOP, YIELD, Drawn, commonroad, lanelet2
+from tests.maps.files import CROSSING, PRIORITY, STOP, YIELD, Drawn, commonroad, lanelet2, traffic_light
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
 from tint_sumo.maps import ImportedMap, import_map
@@ -133,10 +133,46 @@ def test_stop_signs_and_lights(tmp_path: Path) -> None:
     stop = {**CROSSING, 3: replace(CROSSING[3], sign=STOP)}
     net = network(import_map(commonroad(tmp_path / "stop.xml", stop), tmp_path / "net"))
     assert {one.getState() for _, one, *_ in ways(net) if one.getFromLane().getID() == "3_0"} == {"s"}
-    light = {**CROSSING, 3: replace(CROSSING[3], has_light=True)}
+    light = {**CROSSING, 3: replace(CROSSING[3], light=7)}
     net = network(import_map(commonroad(tmp_path / "light.xml", light), tmp_path / "net"))
     assert {node.getType() for node in net.getNodes() if node.getOutgoing() and node.getIncoming()} == {"traffic_light"}
     assert len(net.getTrafficLights()) == 1
+
+
+LIGHTS = {**CROSSING, **{name: replace(CROSSING[name], light=light) for name, light in ((1, 7), (2, 7), (3, 8))}}
+
+
+def test_lights_switch_as_the_map_says(tmp_path: Path) -> None:
+    east = traffic_light(7, [(200, "green"), (30, "yellow"), (270, "red")], 20)  # from 2 s on
+    south = traffic_light(8, [(250, "red"), (20, "redYellow"), (200, "green"), (30, "yellow")], 0)
+    net = network(import_map(commonroad(tmp_path / "map.xml", LIGHTS, east + south), tmp_path / "net"))
+    (light,) = net.getTrafficLights()
+    index = {one[0].getID(): one[2] for one in light.getConnections()}
+    (program,) = light.getPrograms().values()
+    times = np.cumsum([0.0, *(phase.duration for phase in program.getPhases())])
+    states = {
+        lane: [phase.state[number] for phase in program.getPhases()] for lane, number in index.items() if lane != "1_1"
+    }
+    assert times.tolist() == [0.0, 2.0, 22.0, 25.0, 27.0, 47.0, 50.0]
+    assert "".join(states["1_0"]) == "rgyrrr"
+    assert "".join(states["3_0"]) == "rrrugy"
+
+
+@pytest.mark.parametrize(
+    "lights",
+    [
+        traffic_light(7, [(200, "green"), (300, "red")], 0) + traffic_light(8, [(200, "green"), (200, "red")], 0),
+        traffic_light(7, [], 0) + traffic_light(8, [], 0),
+        traffic_light(7, [(200, "green"), (300, "red")], 0, active=False) + traffic_light(8, [(500, "red")], 0),
+        traffic_light(7, [(0, "green"), (500, "red")], 0) + traffic_light(8, [(500, "red")], 0),
+    ],
+    ids=["other periods", "no cycles", "inactive", "no time"],
+)
+def test_other_lights_have_programs_of_netconvert(tmp_path: Path, lights: str) -> None:
+    found = import_map(commonroad(tmp_path / "map.xml", LIGHTS, lights), tmp_path / "net")
+    assert len(network(found).getTrafficLights()) == 1
+    assert not any(".tll." in path.name for path in found.files)
+    assert not drive(found, tmp_path)
 
 
 def test_long_lanelets_that_cross_are_cut(tmp_path: Path) -> None:

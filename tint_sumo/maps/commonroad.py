@@ -9,7 +9,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from tint_sumo.core.errors import InputError
-from tint_sumo.maps.lanelets import Lanelet, LaneletMap, MapFormat, Origin, bound, by_id
+from tint_sumo.maps.lanelets import Lanelet, LaneletMap, Light, MapFormat, Origin, bound, by_id
 from tint_sumo.maps.xml_files import number, read_elements
 
 _SPEED_SIGNS = ("274", "R2-1")  # of Germany and the United States, as the format names them; values in m/s
@@ -18,7 +18,7 @@ _RIGHT_OF_WAY = {
     **dict.fromkeys(("206", "R1-1", "R1-3P"), "stop"),
     **dict.fromkeys(("301", "306"), "priority"),
 }
-_READ = frozenset({"lanelet", "trafficSign", "location"})
+_READ = frozenset({"commonRoad", "lanelet", "trafficSign", "trafficLight", "location"})
 _LEFT_OUT = frozenset({"obstacle", "dynamicObstacle", "staticObstacle"})
 
 
@@ -30,7 +30,9 @@ def _read(file: Path, origin: Origin | None) -> LaneletMap:
     whole = [
         element for element in found["lanelet"] if element.find("leftBound") is not None
     ]  # goals name lanelets, too
-    lanelets = [_lanelet(element, signs, file) for element in whole]
+    step_s = next((root.get("timeStepSize") for root in found["commonRoad"]), None)
+    lights = {light.get("id", ""): _light(light, step_s, file) for light in found["trafficLight"]}
+    lanelets = [_lanelet(element, signs, lights, file) for element in whole]
     opposite = [beside.tag for element in whole for beside in element.findall("*[@drivingDir='opposite']")]
     projection, offset_m = _location(found["location"], file)
     return LaneletMap(
@@ -42,7 +44,7 @@ def _read(file: Path, origin: Origin | None) -> LaneletMap:
     )
 
 
-def _lanelet(element: Element, signs: Mapping[str, Element], file: Path) -> Lanelet:
+def _lanelet(element: Element, signs: Mapping[str, Element], lights: Mapping[str, Light], file: Path) -> Lanelet:
     name = element.get("id", "")
     left, right = (
         bound(
@@ -69,8 +71,19 @@ def _lanelet(element: Element, signs: Mapping[str, Element], file: Path) -> Lane
         right_neighbour=neighbours["adjacentRight"],
         speed_mps=_speed_mps(element, own_signs, file),
         sign=next((_RIGHT_OF_WAY[one] for sign in own_signs for one in _sign_ids(sign) if one in _RIGHT_OF_WAY), None),
-        has_light=element.find(".//trafficLightRef") is not None,
+        light=next((lights.get(ref, Light()) for ref in _references(element, "trafficLightRef")), None),
     )
+
+
+def _light(element: Element, step: str | None, file: Path) -> Light:
+    """Return a traffic light, without its cycle if it has none that lasts."""
+    step_s = number(step, file, "timeStepSize")
+    parts = [(part.findtext("duration"), part.findtext("color")) for part in element.findall("cycle/cycleElement")]
+    durations_s = [number(steps, file, "a duration of a traffic light") * step_s for steps, _ in parts]
+    begin_s = number(element.findtext("cycle/timeOffset") or "0", file, "timeOffset of a traffic light") * step_s
+    if element.findtext("active") == "false" or not all(duration_s > 0.0 for duration_s in durations_s):
+        return Light()
+    return Light(tuple(zip(durations_s, ((colour or "").strip() for _, colour in parts), strict=True)), begin_s)
 
 
 def _references(element: Element, tag: str, depth: str = ".//") -> list[str]:

@@ -23,7 +23,12 @@ from tint_sumo.maps.roads import build_roads
 from tint_sumo.maps.xml_files import ROLE
 from tint_sumo.scenes.network import sumo_program
 
-PARTS = ("nod", "edg", "con", "tll")  # of plain XML
+_PLAIN_FLAGS = {
+    "nod": "--node-files",
+    "edg": "--edge-files",
+    "con": "--connection-files",
+    "tll": "--tllogic-files",
+}
 _HEAD_BYTES = 2**16
 _CHUNK_BYTES, _TAG_BYTES = 2**20, 100
 _LANELET = re.compile(rb"""<tag\s+(k=["']type["']\s+v=["']lanelet["']|v=["']lanelet["']\s+k=["']type["'])""")
@@ -98,7 +103,7 @@ def import_map(
     find_named("format", format_name, FORMATS)
     require_output_folder(out)
     name = _name(file)
-    targets = {kind: out / f"{name}.{kind}.xml" for kind in ("net", *PARTS)}
+    targets = {kind: out / f"{name}.{kind}.xml" for kind in ("net", *_PLAIN_FLAGS)}
     there = [path.name for path in targets.values() if path.exists()]
     if there and not overwrite:
         raise InputError(f"{out} holds {there[0]} already; choose another `out`, or allow to `overwrite`")
@@ -187,7 +192,7 @@ def _build(file: Path, folder: Path, format_name: str, left_hand: bool | None, o
         texts = plain_xml(lanelet_map, roads)
         for part, text in texts.items():
             write_text(folder / f"map.{part}.xml", text)
-        inputs = ("--node-files", "map.nod.xml", "--edge-files", "map.edg.xml", "--connection-files", "map.con.xml")
+        inputs = [word for part in texts for word in (_PLAIN_FLAGS[part], f"map.{part}.xml")]
         warnings = _netconvert(file, folder, [*inputs, *_LANELET_OPTIONS], lanelet_map.left_hand)
         return _Built({"net": _text(folder, "net"), **texts}, lanelet_map.left_hand, roads.left_out, warnings)
     if origin is not None:
@@ -197,7 +202,7 @@ def _build(file: Path, folder: Path, format_name: str, left_hand: bool | None, o
         copyfileobj(content, copy)
     is_left = _drives_on_the_left(folder / name) if left_hand is None else left_hand
     warnings = _netconvert(file, folder, [flag, name, *options, "--plain-output-prefix", "map"], is_left)
-    parts = [part for part in PARTS if (folder / f"map.{part}.xml").exists()]
+    parts = [part for part in _PLAIN_FLAGS if (folder / f"map.{part}.xml").exists()]
     return _Built({part: _text(folder, part) for part in ("net", *parts)}, is_left, (), warnings)
 
 

@@ -15,7 +15,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from tint_sumo.core.errors import InputError
-from tint_sumo.maps.lanelets import Lanelet, LaneletMap, Line, MapFormat, Origin, bound, by_id
+from tint_sumo.maps.lanelets import Lanelet, LaneletMap, Light, Line, MapFormat, Origin, bound, by_id
 from tint_sumo.maps.xml_files import number, read_elements
 
 _NOT_FOR_CARS = frozenset(
@@ -77,7 +77,7 @@ def _read(file: Path, origin: Origin | None) -> LaneletMap:
                 default=None,
             ),
             sign=next((sign for rule in own_rules if (sign := rule.sign(name)) is not None), None),
-            has_light=any(rule.is_light for rule in own_rules),
+            light=Light() if any(rule.is_light for rule in own_rules) else None,
         )
     one_way = [one for name, one in bounds.items() if _tag(roads[name], "one_way") != "no"]
     on_left = sum((one.left.way, one.left.ends[::-1]) in lefts for one in one_way)

@@ -22,6 +22,29 @@ _NARROWEST_M = 0.1
 
 
 @dataclass(frozen=True)
+class Light:
+    """A traffic light. Its cycle has durations in s and colours, and is empty if the map does not have it."""
+
+    cycle: tuple[tuple[float, str], ...] = ()
+    begin_s: float = 0.0  # when a cycle begins
+
+    @property
+    def period_s(self) -> float:
+        return sum(duration_s for duration_s, _ in self.cycle)
+
+    @property
+    def switches_s(self) -> list[float]:
+        """Return when the light changes, from 0 to its period."""
+        ends_s = np.cumsum([duration_s for duration_s, _ in self.cycle])
+        return sorted(float(at_s) for at_s in np.round((self.begin_s + ends_s) % self.period_s, 6))
+
+    def colour(self, time_s: float) -> str:
+        """Return the colour at a time."""
+        ends_s = np.cumsum([duration_s for duration_s, _ in self.cycle])
+        return self.cycle[int(np.searchsorted(ends_s, (time_s - self.begin_s) % self.period_s, side="right"))][1]
+
+
+@dataclass(frozen=True)
 class Lanelet:
     """A piece of a lane. Its bounds run in the direction of driving."""
 
@@ -33,7 +56,7 @@ class Lanelet:
     right_neighbour: str | None = None
     speed_mps: float | None = None  # limit, if the map has one
     sign: str | None = None  # at its end: yield, stop or priority
-    has_light: bool = False  # at its end
+    light: Light | None = None  # at its end
 
     @cached_property
     def centre(self) -> Line:

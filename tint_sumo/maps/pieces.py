@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from scipy.cluster.hierarchy import DisjointSet
 
-from tint_sumo.maps.lanelets import Lanelet, LaneletMap, Line, between
+from tint_sumo.maps.lanelets import Lanelet, LaneletMap, Light, Line, between
 
 CAR_WIDTH_M = 2.0
 SHORTEST_ROAD_M = 7.5  # between two conflicts: room for a car and the gap to the next
@@ -62,10 +62,13 @@ class Pieces:
         limits = [self.lanelets[name].speed_mps for name in self.pieces[piece].lanelets]
         return min((limit for limit in limits if limit is not None), default=None)
 
+    def light(self, place: Place) -> Light | None:
+        """Return the light at the end of one lane of a piece."""
+        return self.lanelets[self.lanelet(place)].light if self.pieces[place[0]].is_last else None
+
     def has_light(self, piece: int) -> bool:
         """Return whether a light stands at the end of a piece."""
-        found = self.pieces[piece]
-        return found.is_last and any(self.lanelets[name].has_light for name in found.lanelets)
+        return any(self.light((piece, lane)) is not None for lane in range(len(self.pieces[piece].lanelets)))
 
     def sign(self, piece: int) -> str | None:
         """Return the sign at the end of a piece."""

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from scipy.cluster.hierarchy import DisjointSet
 
-from tint_sumo.maps.lanelets import LaneletMap, Line, arc_lengths, side_by_side
+from tint_sumo.maps.lanelets import LaneletMap, Light, Line, arc_lengths, side_by_side
 from tint_sumo.maps.pieces import SHORTEST_END_M, Pieces, Place, cut_to_pieces
 
 _MOST_PIECES = 30  # of a way over a junction
@@ -51,6 +51,7 @@ class Way:
     end_lane: int
     lanelets: tuple[str, ...]
     centre: Line | None
+    light: Light | None  # before it, or on it
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,7 @@ class _Plan:
                 *(ids[road_of[start]], start_lane, ids[road_of[end]], end_lane),
                 tuple(dict.fromkeys(self.pieces.lanelet(place) for place in between)),
                 _joined([self.pieces.centre(place) for place in between]) if between else None,
+                next((light for at in ((start, start_lane), *between) if (light := self.pieces.light(at))), None),
             )
             for (start, start_lane), between, (end, end_lane) in self.links
         )

@@ -7,9 +7,13 @@ from pathlib import Path
 import pandas
 import pytest
 
-from tests.cli.calls import run
+from tests.cli.calls import refuse, run
+from tests.drivers.recordings import population, simulated_pair, write_pairs
 from tint_sumo.cli import main
 from tint_sumo.config import RelativeSettings
+from tint_sumo.core.files import write_text
+from tint_sumo.drivers import fitting
+from tint_sumo.traits import identification
 
 
 def test_traits(dataset: Path, tmp_path: Path, trait_model: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -51,3 +55,61 @@ def test_relative_traits_are_fitted_and_become_a_budget(tmp_path: Path, capsys: 
     train = ["policy", "train", "--method", "relative", "--config", str(out), "--out", "run"]
     assert main([*train, "--print-config"]) == 0
     assert f"time_gap_weight: {weight}" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two encounters of 11 s of each of five drivers."""
+    pairs = [
+        simulated_pair(z, 2 * driver + number, 111, follower=str(driver))
+        for driver, z in enumerate(population(5, 3))
+        for number in range(2)
+    ]
+    return write_pairs(tmp_path_factory.mktemp("tracks"), pairs)
+
+
+def test_traits_of_recorded_tracks(
+    tracks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(identification, "_FOLDS", 2)
+    monkeypatch.setattr(identification, "_RESAMPLES", 100)
+    monkeypatch.setattr(fitting, "_STARTS", 1)
+    config = tmp_path / "tiny.yaml"
+    write_text(config, "budget: {base: quick, epochs: 1}\n")
+    train = ["traits", "train", "--tracks", tracks, "--method", "cross_window", "--config", config]
+    card = run(capsys, *train, "--out", tmp_path / "model")
+    assert card["recorded"] == {"tracks": tracks.name, "pairs": 10, "drivers": 5}
+    printed = run(
+        capsys, "traits", "infer", "--tracks", tracks, "--model", tmp_path / "model", "--out", tmp_path / "table.csv"
+    )
+    assert (printed["vehicles"], printed["windows"], printed["outside"]) == (5, card["windows"], 0.0)
+    found = run(capsys, "traits", "identify", "--tracks", tracks, "--model", tmp_path / "model")["measures"]
+    assert {one["situation"] for one in found} == {"other encounters"}  # none is long enough to be halved
+    assert {one["count"] for one in found if one["group"] == "identified"} == {10}
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["train", "--out", "OUT"], "give either data or tracks"),
+        (["train", "--data", "T", "--tracks", "T", "--out", "OUT"], "give either data or tracks"),
+        (["train", "--data", "T", "--fit", "T", "--out", "OUT"], "fit and format belong to tracks"),
+        (["train", "--tracks", "T", "--streaming", "--out", "OUT"], "streaming is for datasets"),
+        (["infer", "--model", "vae", "--out", "OUT.csv"], "give either fcd or tracks"),
+        (
+            ["infer", "--fcd", "T", "--format", "ngsim", "--model", "vae", "--out", "OUT.csv"],
+            "format is that of tracks",
+        ),
+        (["infer", "--tracks", "T", "--net", "T", "--model", "vae", "--out", "OUT.csv"], "net and vtypes belong to"),
+        (["infer", "--tracks", "T", "--model", "vae", "--out", "OUT.csv"], "lie outside what vae was trained on"),
+        (["identify", "--tracks", "T", "--model", "vae"], "vae predicts nothing; give a model of method cross_window"),
+        (["identify", "--tracks", "T", "--model", "cross_window"], "lie outside what cross_window was trained on"),
+    ],
+)
+def test_unusable_tracks_and_flags_are_refused(
+    argv: list[str], message: str, tracks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = {"T": tracks, "OUT": tmp_path / "out", "OUT.csv": tmp_path / "out.csv"}
+    assert message in refuse(capsys, "traits", *(places.get(word, word) for word in argv))
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "out.csv").exists()

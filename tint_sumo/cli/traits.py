@@ -1,13 +1,14 @@
 """``tint-sumo traits``."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar
 
 from tyro.conf import arg, subcommand
 
 from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, names_in, use_one_thread, wrote
+from tint_sumo.cli.tracks import TrackFormatName
 from tint_sumo.cli.values import (
     SCENES,
     TRAIT_BUDGET,
@@ -34,6 +35,19 @@ _NOISE = optional(
 )
 _NET = optional("FILE", "Network of the scenario (.net.xml); without it no leader beyond the end of a lane is seen.")
 
+_DATA = optional("FOLDER", "Dataset of windows and traits; give either this or --tracks.")
+_TRACKS = optional("PATH", "Recorded tracks, a file or a folder of files, of any format that tracks inspect reads.")
+_FIT = optional(
+    "FOLDER",
+    "Fit of the recorded drivers (tint-sumo drivers fit): the model learns from drivers that are drawn from it, behind "
+    "the recorded leaders; with --tracks.",
+    "the model learns from the recorded drivers themselves",
+)
+_FCD = optional(
+    "PATH",
+    "Floating-car data of SUMO (sumo --fcd-output: XML, CSV or Parquet), or a recorded dataset; give either this or "
+    "--tracks.",
+)
 _MOST_CONFUSED = 10  # traits in the printed table
 _VTYPES = optional(
     "FILE",
@@ -44,12 +58,14 @@ _VTYPES = optional(
 
 @dataclass(frozen=True, kw_only=True)
 class TrainTraits(Command):
-    """Train a trait model on a dataset; the same command resumes an interrupted training."""
+    """Train a trait model on a dataset or on recorded tracks; the same command resumes an interrupted training."""
 
     after_interrupt: ClassVar[str] = RESUMES
 
-    data: Path
-    """Folder of a dataset."""
+    data: Annotated[Path | None, _DATA] = None
+    tracks: Annotated[Path | None, _TRACKS] = None
+    fit: Annotated[Path | None, _FIT] = None
+    format: TrackFormatName = None
     out: Path
     """Folder for the model."""
     method: str = "vae"
@@ -65,6 +81,7 @@ class TrainTraits(Command):
     def run(self) -> Outcome:
         from tint_sumo.jobs.table import one_job
         from tint_sumo.traits.datasets import require_used, train_traits
+        from tint_sumo.traits.recorded import train_on_tracks
 
         settings = TRAIT_BUDGET.full(self.budget)
         if self.noise is not None:
@@ -72,16 +89,34 @@ class TrainTraits(Command):
                 raise InputError(f"noise is {self.noise:g} m, and {settings.noise_m:g} m in the budget; give it once")
             settings = replace(settings, noise_m=self.noise)
         require_used(self.method, settings)
+        require_one(data=self.data, tracks=self.tracks)
         with one_job(f"traits {self.method}") as report:
-            card = train_traits(
-                self.data,
-                self.out,
-                method=self.method,
-                settings=settings,
-                seed=self.seed,
-                streaming=self.streaming,
-                report=report,
-            )
+            if self.tracks is not None:
+                if self.streaming:
+                    raise InputError("streaming is for datasets; leave it out with tracks")
+                card = train_on_tracks(
+                    self.tracks,
+                    self.out,
+                    method=self.method,
+                    settings=settings,
+                    seed=self.seed,
+                    fit=self.fit,
+                    format_name=self.format,
+                    report=report,
+                )
+            else:
+                assert self.data is not None
+                if self.fit is not None or self.format is not None:
+                    raise InputError("fit and format belong to tracks; give them with tracks in place of data")
+                card = train_traits(
+                    self.data,
+                    self.out,
+                    method=self.method,
+                    settings=settings,
+                    seed=self.seed,
+                    streaming=self.streaming,
+                    report=report,
+                )
         return Outcome(
             f"trained {self.method} on {card['windows']} windows: {self.out}", {**card, "out": str(self.out)}
         )
@@ -181,10 +216,11 @@ class PlotTraits(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class InferTraits(Command):
-    """Infer the traits of the vehicles in any SUMO run: a table of latents per vehicle and window of 2 s."""
+    """Infer the traits of the vehicles in any SUMO run or recording: a table of latents per vehicle and 2 s."""
 
-    fcd: Path
-    """Floating-car data of SUMO (sumo --fcd-output: XML, CSV or Parquet), or a recorded dataset."""
+    fcd: Annotated[Path | None, _FCD] = None
+    tracks: Annotated[Path | None, _TRACKS] = None
+    format: TrackFormatName = None
     model: TraitModelName
     out: Path
     """Table to write, .csv or .parquet."""
@@ -194,15 +230,30 @@ class InferTraits(Command):
     vtypes: Annotated[Path | None, _VTYPES] = None
 
     def run(self) -> Outcome:
-        from tint_sumo.traits.inference import OUTSIDE, SUFFIXES, infer_traits, outside_lines, write_table
+        from tint_sumo.traits.inference import (
+            OUTSIDE,
+            SUFFIXES,
+            infer_recorded,
+            infer_traits,
+            outside_lines,
+            write_table,
+        )
 
-        if self.out.exists() and self.fcd.exists() and self.out.samefile(self.fcd):
+        source = require_one(fcd=self.fcd, tracks=self.tracks)
+        if self.out.exists() and source.exists() and self.out.samefile(source):
             raise InputError(f"{self.out} holds the data themselves; choose another --out")
         require_output_file(self.out, SUFFIXES)
         use_one_thread()
-        table = infer_traits(
-            self.fcd, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length, vtypes_file=self.vtypes
-        )
+        if self.tracks is not None:
+            if self.net is not None or self.vtypes is not None:
+                raise InputError("net and vtypes belong to floating-car data; leave them out with tracks")
+            table = infer_recorded(source, self.model, self.format)
+        else:
+            if self.format is not None:
+                raise InputError("format is that of tracks; give it with tracks in place of fcd")
+            table = infer_traits(
+                source, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length, vtypes_file=self.vtypes
+            )
         write_table(table, self.out)
         outside = float(table[OUTSIDE].mean()) if OUTSIDE in table else None
         content = {"out": str(self.out), "windows": len(table), "vehicles": int(table["vehicle"].nunique())}
@@ -213,6 +264,33 @@ class InferTraits(Command):
             )
         text = f"{content['windows']} windows of {content['vehicles']} vehicles: {self.out}\n{reach}"
         return Outcome(text, {**content, "outside": outside, "columns": list(table)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentifyTraits(Command):
+    """Measure on recorded drivers, without labels, how far traits predict, identify drivers and stay the same."""
+
+    tracks: Path
+    """Recorded tracks, a file or a folder of files, of any format that tracks inspect reads."""
+    model: TraitModelName
+    format: TrackFormatName = None
+
+    def run(self) -> Outcome:
+        from tint_sumo.drivers.pairs import read_pairs
+        from tint_sumo.jobs.table import one_job
+        from tint_sumo.traits import load
+        from tint_sumo.traits.cross_window import CrossWindow
+        from tint_sumo.traits.identification import identify, report_text
+        from tint_sumo.traits.inference import infer_recorded
+
+        use_one_thread()
+        trained = load(self.model)
+        if not isinstance(trained, CrossWindow):
+            raise InputError(f"{self.model} predicts nothing; give a model of method cross_window")
+        infer_recorded(self.tracks, self.model, self.format)  # refuses tracks of other scales
+        with one_job("identify") as report:
+            measures = identify(read_pairs(self.tracks, self.format).pairs, lambda *_: trained, report)
+        return Outcome(report_text(measures), {"measures": [asdict(one) for one in measures]})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,8 +326,21 @@ class Traits:
         | Annotated[EvaluateTraits, subcommand("evaluate")]
         | Annotated[PlotTraits, subcommand("plot")]
         | Annotated[InferTraits, subcommand("infer")]
+        | Annotated[IdentifyTraits, subcommand("identify")]
         | Annotated[StudyTraits, subcommand("study")]
     )
+
+
+def require_one(**given: Path | None) -> Path:
+    """Return the only path among some that are given by their flags.
+
+    Raises:
+        InputError: there is none, or more than one.
+    """
+    paths = [path for path in given.values() if path is not None]
+    if len(paths) != 1:
+        raise InputError(f"give either {' or '.join(given)}")
+    return paths[0]
 
 
 def _part_name(name: str) -> str:

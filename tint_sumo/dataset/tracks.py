@@ -61,16 +61,22 @@ def _successor(lane: Any) -> str:
     return ways[0] if len(ways) == 1 else ""
 
 
-def gaps_m(rows: pd.DataFrame, length_m: NDArray[np.float64], lanes: Lanes | None = None) -> NDArray[np.float64]:
+def gaps_m(
+    rows: pd.DataFrame,
+    length_m: NDArray[np.float64],
+    lanes: Lanes | None = None,
+    reach_m: float = NO_LEADER_GAP_M,
+) -> NDArray[np.float64]:
     """Return the gap (M,) from each vehicle's front to the back of the next vehicle at that time; NaN if none is seen.
 
     A leader is seen on the vehicle's lane and, if ``lanes`` are given, on those that follow it without a choice and
-    begin so near that the gap can be less than ``NO_LEADER_GAP_M``.
+    begin so near that the gap can be less than ``reach_m``.
 
     Args:
         rows: columns time_s, lane and pos_m as ``tint_sumo.dataset.fcd_reader.read_fcd`` gives them.
         length_m: of each row's vehicle, (M,).
         lanes: of the network.
+        reach_m: gap from which on a leader counts as none.
 
     Raises:
         InputError: the network lacks a lane of the rows.
@@ -94,7 +100,7 @@ def gaps_m(rows: pd.DataFrame, length_m: NDArray[np.float64], lanes: Lanes | Non
     row = np.flatnonzero(np.isnan(gap_m))
     to_end_m, ahead = lanes.length_m[lane[row]] - pos_m[row], lanes.successor[lane[row]]
     while len(row):
-        seen = (ahead >= 0) & (to_end_m < NO_LEADER_GAP_M + length_m.max())
+        seen = (ahead >= 0) & (to_end_m < reach_m + length_m.max())
         row, to_end_m, ahead = row[seen], to_end_m[seen], ahead[seen]
         rearmost = np.searchsorted(queue, when[row] + ahead).clip(max=len(queue) - 1)
         found = queue[rearmost] == when[row] + ahead
@@ -110,6 +116,7 @@ def read_tracks(
     net_file: Path | None = None,
     vehicle_length_m: float = VehicleShape().length_m,
     vtypes_file: Path | None = None,
+    reach_m: float = NO_LEADER_GAP_M,
 ) -> pd.DataFrame:
     """Return rows of tracks, sorted by track and time, at steps of 0.1 s.
 
@@ -121,6 +128,7 @@ def read_tracks(
         net_file: network of floating-car data; with it leaders are seen beyond the end of a lane.
         vehicle_length_m: of the vehicles in floating-car data, if no file of vTypes says it.
         vtypes_file: route file, additional file or .sumocfg with the vTypes of floating-car data.
+        reach_m: gap up to which leaders are seen beyond the end of a lane.
 
     Returns:
         Columns vehicle (category; EPISODE.VEHICLE for a dataset), track (number), time_s (episode e of a dataset starts
@@ -143,7 +151,7 @@ def read_tracks(
     on_road = ~are_parked(rows)
     if not on_road.any():
         raise InputError(f"{source} has parked vehicles only; write it again with traffic in it")
-    return _in_steps(_driven(rows[on_road], length_m[on_road], lanes), source)
+    return _in_steps(_driven(rows[on_road], length_m[on_road], lanes, reach_m), source)
 
 
 def _lengths_m(rows: pd.DataFrame, vtypes_file: Path, source: Path) -> NDArray[np.float64]:
@@ -189,13 +197,13 @@ def _recorded(source: Path) -> pd.DataFrame:
     )
 
 
-def _driven(rows: pd.DataFrame, length_m: NDArray[np.float64], lanes: Lanes | None) -> pd.DataFrame:
+def _driven(rows: pd.DataFrame, length_m: NDArray[np.float64], lanes: Lanes | None, reach_m: float) -> pd.DataFrame:
     """Return columns vehicle, time_s, position_m and gap_m, by vehicle and time.
 
     Speeds are the finer measure of displacements: rounded to 0.01 m/s they give those of 0.1 s to the millimetre, and
     SUMO's displacements are speed times step. Positions on one lane correct them beyond a position's last digit.
     """
-    rows = rows.assign(gap_m=gaps_m(rows, length_m, lanes))
+    rows = rows.assign(gap_m=gaps_m(rows, length_m, lanes, reach_m))
     rows = rows.sort_values(["vehicle", "time_s"], ignore_index=True)
     moved_m = rows["pos_m"].diff().to_numpy()
     along_lane = (rows["lane"].cat.codes.diff() == 0).to_numpy() & (moved_m > -_POS_DIGIT_M)

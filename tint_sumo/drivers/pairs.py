@@ -42,7 +42,8 @@ _ON_FOOT = ("pedestrian", "bicycle", "cyclist", "person", "animal", "wheelchair"
 class Pair:
     """A follower behind one leader without a break, with rows every ``step_s``.
 
-    Positions are those along the follower's way from where its track begins.
+    Positions are those along the follower's way from where its track begins. A stretch without a leader, which only
+    those get who ask for it, has the leader ``""`` and an infinite ``leader_rear_m``.
     """
 
     recording: str
@@ -107,7 +108,12 @@ def left_out_text(found: Recorded) -> list[str]:
 
 
 def read_pairs(
-    path: Path, format_name: str | None = None, step_s: float = STEP_S, min_duration_s: float = MIN_DURATION_S
+    path: Path,
+    format_name: str | None = None,
+    step_s: float = STEP_S,
+    min_duration_s: float = MIN_DURATION_S,
+    *,
+    with_free: bool = False,
 ) -> Recorded:
     """Read the pairs of a file of tracks, or of all such files in a folder.
 
@@ -116,13 +122,14 @@ def read_pairs(
         format_name: format of the tracks; recognised if not given.
         step_s: time between the rows of the pairs, which are interpolated between those of the recording.
         min_duration_s: shorter pairs are left out.
+        with_free: return stretches without a leader, too. A leader-follower file does not know whom leaders follow.
 
     Raises:
         InputError: nothing can be read, a file is damaged, positions and speeds have different units, there is no pair
             that is long enough, or a pair is there twice.
     """
     files, unread = _files(path, format_name)
-    parts = [find_pairs(read_tracks(file, format_name), step_s, min_duration_s) for file in files]
+    parts = [find_pairs(read_tracks(file, format_name), step_s, min_duration_s, with_free=with_free) for file in files]
     pairs = tuple(pair for part in parts for pair in part.pairs)
     found = Recorded(
         pairs,
@@ -161,7 +168,9 @@ def _require_each_once(pairs: tuple[Pair, ...]) -> None:
             raise InputError(f"{second.name} is there more than once; give each recording once")
 
 
-def find_pairs(tracks: Tracks, step_s: float = STEP_S, min_duration_s: float = MIN_DURATION_S) -> Recorded:
+def find_pairs(
+    tracks: Tracks, step_s: float = STEP_S, min_duration_s: float = MIN_DURATION_S, *, with_free: bool = False
+) -> Recorded:
     """Find the pairs in some tracks; see ``read_pairs``."""
     table, track = tracks.table, tracks.track_number
     time_s, x_m, y_m, heading_rad, speed_mps, length_m, width_m = (
@@ -171,21 +180,25 @@ def find_pairs(tracks: Tracks, step_s: float = STEP_S, min_duration_s: float = M
     wrong = _inconsistent(tracks, track, time_s, speed_mps, driven_m, jumping)
     drives = ~np.isin(track, wrong) & ~_on_foot(table)
     rows, begins = _by_moment(table, drives)
-    reach_m, straight_m = (math.inf, math.inf) if tracks.format == "leader_follower" else (REACH_M, _STRAIGHT_M)
+    named = tracks.format == "leader_follower"
+    reach_m, straight_m = (math.inf, math.inf) if named else (REACH_M, _STRAIGHT_M)
     leader, ahead_m = np.full(len(track), -1, np.int64), np.zeros(len(track))
     _find_leaders(rows, begins, track, x_m, y_m, heading_rad, length_m, width_m, reach_m, straight_m, leader, ahead_m)
     pairs, short = [], 0
     names = [table[name].astype(str).to_numpy() for name in ("recording", "vehicle")]
     for first, last in _stretches(track, time_s, leader, jumping):
         own, other = slice(first, last), leader[first:last]
+        free = other[0] < 0
+        if free and (named or not with_free or not drives[first]):
+            continue
         pair = Pair(
             recording=names[0][first],
             follower=names[1][first],
-            leader=names[1][other[0]],
+            leader="" if free else names[1][other[0]],
             start_s=float(time_s[first]),
             step_s=step_s,
-            leader_rear_m=driven_m[own] + ahead_m[own] - length_m[other] / 2.0,
-            leader_speed_mps=speed_mps[other],
+            leader_rear_m=driven_m[own] + (math.inf if free else ahead_m[own] - length_m[other] / 2.0),
+            leader_speed_mps=np.zeros(last - first) if free else speed_mps[other],
             front_m=driven_m[own] + length_m[own] / 2.0,
             speed_mps=speed_mps[own],
         )
@@ -345,7 +358,7 @@ def _along_way(
 def _stretches(
     track: NDArray[np.int64], time_s: Floats, leader: NDArray[np.int64], jumping: NDArray[np.int64]
 ) -> Iterator[tuple[int, int]]:
-    """Yield first and last row (exclusive) of each stretch of a track with one leader and without a break."""
+    """Yield first and last row (exclusive) of each stretch of a track with one leader or none and without a break."""
     jumps = np.isin(np.arange(len(track)), jumping)
     cut = jumps | ((leader >= 0) & jumps[leader])
     leading = np.where(leader >= 0, track[leader], -1)
@@ -355,7 +368,7 @@ def _stretches(
     joined = same_track & (leading[1:] == leading[:-1]) & (steps_s <= _LONG_STEP * usual_s) & ~cut[1:]
     bounds = np.concatenate([[0], np.flatnonzero(~joined) + 1, [len(track)]])
     for first, last in pairwise(bounds):
-        if leading[first] >= 0 and last - first > 1:
+        if last - first > 1:
             yield int(first), int(last)
 
 
@@ -364,4 +377,7 @@ def _at_step(pair: Pair, time_s: Floats) -> Pair:
     count = int((time_s[-1] - time_s[0]) / pair.step_s + 1e-6) + 1
     wanted_s = time_s[0] + pair.step_s * np.arange(count)
     columns = ("leader_rear_m", "leader_speed_mps", "front_m", "speed_mps")
-    return replace(pair, **{name: np.interp(wanted_s, time_s, getattr(pair, name)) for name in columns})
+    found = {name: np.interp(wanted_s, time_s, getattr(pair, name)) for name in columns}
+    if not pair.leader:
+        found["leader_rear_m"] = np.full(count, np.inf)
+    return replace(pair, **found)

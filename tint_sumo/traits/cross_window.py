@@ -77,3 +77,31 @@ class CrossWindow(TraitModel):
         displacement, log_std = self.prediction(joined.relu()).float().unbind(dim=-1)
         valid = valid_steps(features, batch.other.length)[:, 1:].T
         return displacement, log_std.clamp(*LOG_STD_RANGE), features[:, 1:, 0].T, valid
+
+    @torch.no_grad()
+    def ahead_m(self, states: Tensor, latents: Tensor, seen: int) -> Tensor:
+        """Predict how far drivers go in the rest of some windows, behind leaders whose motion is known.
+
+        Args:
+            states: (N, T, 2) of whole windows.
+            latents: (N, latent_size) of their drivers.
+            seen: number of steps that are looked at; those after them are predicted one by one.
+
+        Returns:
+            (N,) distances in m.
+        """
+        whole = torch.full((len(states),), states.shape[1])
+        features = self.features(states, whole)
+        shift = self.from_latent(latents)
+        _, hidden = self.follower(features[:, :seen].transpose(0, 1))
+        leader_m = states.sum(dim=-1).diff(dim=1)  # displacements of the leader
+        gap_m, total_m = states[:, seen - 1, 1], torch.zeros(len(states))
+        is_free = states[..., 1].amax(dim=1) >= self.no_leader_gap_m
+        for step in range(seen, states.shape[1]):
+            joined = self.from_follower(hidden[0]) + shift
+            displacement_m = self.prediction(joined.relu())[:, 0] * self.feature_scale[0] + self.feature_mean[0]
+            total_m = total_m + displacement_m
+            gap_m = torch.where(is_free, gap_m, gap_m + leader_m[:, step - 1] - displacement_m)
+            raw = torch.stack((displacement_m, gap_m), dim=-1)
+            _, hidden = self.follower(((raw - self.feature_mean) / self.feature_scale).unsqueeze(0), hidden)
+        return total_m

@@ -27,7 +27,7 @@ from tint_sumo.scenes.drivers import require_two_kinds
 from tint_sumo.traits.evaluation import TEST_FRACTION, evaluate
 from tint_sumo.traits.figures import plot_latents, plot_reconstructions
 from tint_sumo.traits.model import find_trait_method
-from tint_sumo.traits.storage import read_card, require_scene
+from tint_sumo.traits.storage import read_card, require_scene, require_scene_gaps
 from tint_sumo.traits.training import train
 from tint_sumo.traits.vae import Vae
 
@@ -153,6 +153,7 @@ def _load_for_test(
     """Return a model, the windows of a dataset it may be tested on, their labels, and the seed of the split."""
     require_noise(noise_m)
     trained = traits.load(model)
+    require_scene_gaps(model)
     if not other_scene:
         described = describe(data)
         require_scene(model, described["scene"], described["scene_digest"], str(data))

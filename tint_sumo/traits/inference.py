@@ -1,4 +1,4 @@
-"""Traits of the drivers in any SUMO scenario: a table of latents from floating-car data. No label is needed."""
+"""Traits of the drivers in any SUMO scenario or recording: a table of latents. No label is needed."""
 
 from pathlib import Path
 
@@ -6,19 +6,24 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import MIN_WINDOW_STEPS, NO_LEADER_GAP_M, STEP_S, VehicleShape
+from tint_sumo.config import MIN_WINDOW_STEPS, STEP_S, WINDOW_STEPS, VehicleShape
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import require_output_file, whole_file
 from tint_sumo.core.percentages import percent
 from tint_sumo.dataset.tracks import read_tracks
-from tint_sumo.dataset.windows import cut_windows, window_rows
+from tint_sumo.dataset.windows import Windows, cut_windows, window_rows
+from tint_sumo.drivers.pairs import read_pairs
 from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.evaluation import Latents, encode_windows
+from tint_sumo.traits.input_range import InputRange
+from tint_sumo.traits.model import TraitModel
+from tint_sumo.traits.recorded import windows_of
 from tint_sumo.traits.storage import load, read_card
 from tint_sumo.traits.streaming import fuse_so_far
 
 SUFFIXES = (".csv", ".parquet")
 OUTSIDE = "outside"  # the column
+_MOST_OUTSIDE = 0.9  # share of recorded windows; a model says nothing about more
 
 
 def infer_traits(
@@ -39,25 +44,75 @@ def infer_traits(
         vtypes_file: route file, additional file or .sumocfg with the vTypes of floating-car data.
 
     Returns:
-        vehicle (id), window (0, 1, ... of the vehicle), start_s, end_s, steps, has_leader (one within 20 m at every
-        step), latent_1, ... and std_1, ... (mean and standard deviation of the window's posterior). Of
-        ``cross_window``, also fused_latent_1, ... and fused_std_1, ...: what the vehicle's windows say together, up
-        to this one. If the model's card knows the range of its training's inputs, also outside: whether the window has
-        a step whose offset or gap no training window had; and which of them is the farthest beyond
+        vehicle (id), window (0, 1, ... of the vehicle), start_s, end_s, steps, has_leader (at every step, and nearer
+        than the gap that stands for none, which is 20 m in scenes), latent_1, ... and std_1, ... (mean and standard
+        deviation of the window's posterior). Of ``cross_window``, also fused_latent_1, ... and fused_std_1, ...: what
+        the vehicle's windows say together, up to this one. If the model's card knows the range of its training's
+        inputs, also outside: whether the window has a step whose offset or gap no training window had; and which of
+        them is the farthest beyond
         (``tint_sumo.traits.input_range.InputRange.farthest_outside``).
 
     Raises:
         InputError: unusable data, network, length or model.
     """
-    trained, reach = load(model), read_card(model).input_range
-    rows = read_tracks(source, net_file=net_file, vehicle_length_m=vehicle_length_m, vtypes_file=vtypes_file)
+    trained = load(model)
+    limit_m = trained.no_leader_gap_m
+    rows = read_tracks(
+        source, net_file=net_file, vehicle_length_m=vehicle_length_m, vtypes_file=vtypes_file, reach_m=limit_m
+    )
     track = rows["track"].to_numpy()
-    gap_m = rows["gap_m"].where(rows["gap_m"] < NO_LEADER_GAP_M, np.inf).to_numpy()
-    windows = cut_windows(track, np.zeros_like(track), rows["position_m"].to_numpy(), gap_m)
+    gap_m = rows["gap_m"].where(rows["gap_m"] < limit_m, np.inf).to_numpy()
+    windows = cut_windows(track, np.zeros_like(track), rows["position_m"].to_numpy(), gap_m, limit_m)
     if len(windows) == 0:
         raise InputError(f"{source} has no vehicle for {MIN_WINDOW_STEPS} steps of {STEP_S} s; write a longer run")
     first, _ = window_rows(track)
-    vehicle, start_s = rows["vehicle"].iloc[first].array, rows["time_s"].to_numpy()[first]
+    return _table(
+        trained,
+        read_card(model).input_range,
+        rows["vehicle"].iloc[first].array,
+        rows["time_s"].to_numpy()[first],
+        windows,
+    )
+
+
+def infer_recorded(source: Path, model: str | Path, format_name: str | None = None) -> pd.DataFrame:
+    """Return latents of all recorded vehicles, by vehicle and time.
+
+    Args:
+        source: file of tracks in any format of ``tint_sumo.tracks``, or folder of such files.
+        model: as in ``infer_traits``.
+        format_name: format of the tracks; recognised if not given.
+
+    Returns:
+        the columns of ``infer_traits``; vehicle is RECORDING/VEHICLE. A window ends where a vehicle's leader changes.
+
+    Raises:
+        InputError: unusable tracks or model, or nearly all windows are outside what the model was trained on.
+    """
+    trained, reach = load(model), read_card(model).input_range
+    pairs = read_pairs(source, format_name, with_free=True).pairs
+    windows, number = windows_of(pairs, trained.no_leader_gap_m)
+    in_pair = pd.Series(number).groupby(number).cumcount().to_numpy()
+    start_s = np.array([pair.start_s for pair in pairs])[number] + in_pair * WINDOW_STEPS * STEP_S
+    vehicle = pd.Categorical([pairs[one].driver for one in number.tolist()])
+    table = _table(trained, reach, vehicle, start_s, windows)
+    if OUTSIDE in table and table[OUTSIDE].mean() > _MOST_OUTSIDE:
+        (farthest, *_) = outside_lines(table)
+        raise InputError(
+            f"{percent(float(table[OUTSIDE].mean()))}% of the windows of {source} lie outside what {model} was trained "
+            f"on ({farthest.strip()}); train a model on such tracks: tint-sumo traits train --tracks"
+        )
+    return table
+
+
+def _table(
+    trained: TraitModel,
+    reach: InputRange | None,
+    vehicle: pd.Categorical,
+    start_s: NDArray[np.float64],
+    windows: Windows,
+) -> pd.DataFrame:
+    """Return the table of windows that are sorted by vehicle and time."""
     number = np.asarray(pd.Series(vehicle.codes).groupby(vehicle.codes).cumcount(), np.int64)
     latents = encode_windows(trained, windows)
     return pd.DataFrame(

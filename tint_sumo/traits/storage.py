@@ -94,17 +94,22 @@ def read_card(name_or_path: str | Path) -> ModelCard:
 
 def require_scene(name_or_path: str | Path, scene: str, digest: str, user: str) -> None:
     """Raise InputError if a model was trained in another scene than its user's, or in another version of it."""
-    card = read_card(name_or_path)
-    if card.no_leader_gap_m != NO_LEADER_GAP_M:
-        raise InputError(
-            f"trait model {name_or_path} knows gaps up to {card.no_leader_gap_m:g} m, and scenes have gaps up to "
-            f"{NO_LEADER_GAP_M:g} m; train one on a dataset of scene {scene}"
-        )
-    data = card.data or {}
+    require_scene_gaps(name_or_path)
+    data = read_card(name_or_path).data or {}
     if data.get("scene_digest", digest) != digest:
         raise InputError(
             f"trait model {name_or_path} was trained in scene {data.get('scene')}, {user} is of scene {scene}; "
             "give `other_scene` to use it all the same"
+        )
+
+
+def require_scene_gaps(name_or_path: str | Path) -> None:
+    """Raise InputError if a model knows other gaps than scenes have, as it was trained on recorded tracks."""
+    limit_m = read_card(name_or_path).no_leader_gap_m
+    if limit_m != NO_LEADER_GAP_M:
+        raise InputError(
+            f"trait model {name_or_path} knows gaps up to {limit_m:g} m, and scenes have gaps up to "
+            f"{NO_LEADER_GAP_M:g} m; train one on a dataset"
         )
 
 

@@ -317,3 +317,14 @@ def test_sumo_can_drive_the_ego(street: Path) -> None:
             env.step(np.int64(STOP))
         assert env.simulation.egos.distance_m[0].min() > 0.5
         assert env.simulation.egos.speed_mps[0] == pytest.approx(4.0, abs=1.0)  # behind the slow one
+
+
+def test_the_vehicle_that_the_ego_has_taken_over_does_not_come_again(street: Path) -> None:
+    parts = [Driven("west", 90.0, LOWER_Y_M, -10.0, last_s=4.0), Driven("west", 40.0, LOWER_Y_M, -10.0, 6.0)]
+    with made(street, built([one.rows() for one in [*parts, FOLLOWER]]), ego="west", sight_m=400.0) as env:
+        env.reset(options={"case": 0})
+        seen: set[str] = set()
+        for _ in range(100):
+            env.step(np.int64(FAST))
+            seen |= boxes(env).keys()
+        assert seen == {"follower"}

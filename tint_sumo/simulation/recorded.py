@@ -70,8 +70,9 @@ class RecordedTraffic:
         self._overlapped: set[tuple[int, int]] = set()
         self._waits: Bools = np.ones(len(recording.vehicles), bool)  # tracks that may still appear, or follow
         self._waits[list(self._case.left_out)] = False
-        if self._case.track != NO_TRACK:
-            self._waits[self._case.track] = False
+        if self._case.track != NO_TRACK:  # whose vehicle can have other tracks, if it was lost for a while
+            own = recording.vehicles[self._case.track]
+            self._waits[[vehicle == own for vehicle in recording.vehicles]] = False
         self._types, self._routes = set[str](), set[str]()
         self._step_s = scene.step_s
         self._horizon = round(scene.release_s / scene.step_s)

@@ -136,3 +136,18 @@ def test_vehicles_seen_on_a_junction_have_the_edges_before_and_behind_it(
     (one,) = from_tracks(street, recording([mover, Driven("east", -90.0, UPPER_Y_M, 10.0)]), "east").recordings
     assert one.routes[one.vehicles.index("west")] == route
     assert one.keeps_route.all()
+
+
+def test_a_file_of_tracks_is_read(street: Path, tmp_path: Path) -> None:
+    """SUMO's floating-car data, whose positions are those of fronts."""
+    steps = "".join(
+        f'<timestep time="{step / 10:.1f}"><vehicle id="west" x="{87.5 - step}" y="{LOWER_Y_M}" angle="270" speed="10" '
+        f'pos="{step}" lane="lower_in.0_0" type="car"/></timestep>'
+        for step in range(151)
+    )
+    file = tmp_path / "fcd.xml"
+    file.write_text(f"<fcd-export>{steps}</fcd-export>", encoding="utf-8")
+    scene, known = from_tracks(street, file), from_tracks(street, recording([WEST]))
+    assert scene.name == "fcd"
+    np.testing.assert_allclose(scene.recordings[0].box["x_m"], known.recordings[0].box["x_m"])
+    assert scene.cases[0].goal_m == pytest.approx(known.cases[0].goal_m)

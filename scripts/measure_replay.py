@@ -42,7 +42,7 @@ from tint_sumo.tracks import Tracks, read_tracks
 from tint_sumo.tracks.schema import build_tracks
 
 RESULTS = Path(__file__).parents[1] / "data" / "results" / "replay.csv"
-SEEDS = range(12)
+SEEDS = range(4)
 HIDDEN = 48  # drivers, whose headway (s), minimum gap (m), acceleration and braking (m/s2) are hidden from fits:
 MEDIANS, SPREADS = (1.2, 2.0, 1.8, 2.5), (0.35, 0.3, 0.3, 0.3)  # log-normal
 RECORDED_S = 60.0

@@ -256,8 +256,35 @@ def test_the_table_of_own_networks_is_that_of_the_results() -> None:
             assert cell == f"{' / '.join(str(row[f'{name}_percent']) for name in names)}, {time}"
 
 
-def _outcomes(row: pandas.Series) -> str:
-    return " / ".join(str(row[f"{outcome}_percent"]) for outcome in BUILT_IN_OUTCOMES)
+def test_the_numbers_of_recordings_are_those_of_the_results() -> None:
+    measured = pandas.read_csv(RESULTS / "replay.csv").set_index(["recording", "others", "ego"])
+    street = "street, recorded here"
+    page = DOCS / "how-to" / "replay.md"
+    (table,) = (one for one in _tables(page) if "always go" in one)
+    head, _, *lines = table.strip().split("\n")
+    egos = head.strip("| ").split(" | ")[1:]
+    truth = measured.loc[street].iloc[:3]
+    assert lines[0] == "| the truth | " + " | ".join(_outcomes(row, "true_") for _, row in truth.iterrows()) + " |"
+    assert [line.strip("| ").split(" | ")[0] for line in lines[1:]] == list(dict.fromkeys(_kinds(measured, street)))
+    for line in lines[1:]:
+        kind, *cells = line.strip("| ").split(" | ")
+        rows = [measured.loc[(street, kind, ego)] for ego in egos]
+        assert cells == [
+            f"{_outcomes(row)}; {row['same_outcome_percent']:.0f} %; {row['position_error_m']:.2f} m" for row in rows
+        ]
+    off_m = measured.xs("as recorded", level="ego")["released_error_m"]
+    for scene, title in (("USA_Lanker-1_1_T-1", "Lankershim Boulevard"), ("USA_Peach-4_8_T-1", "Peachtree Street")):
+        kinds = ("fitted", "one IDM for all", "SUMO's default")
+        shown = ", ".join(f"{off_m[(scene, kind)]:.2f} m" for kind in kinds)
+        assert f"{title}: {shown}" in _prose(str(page))
+
+
+def _kinds(measured: pandas.DataFrame, recording: str) -> list[str]:
+    return [str(kind) for kind in measured.loc[recording].index.get_level_values("others")]
+
+
+def _outcomes(row: pandas.Series, prefix: str = "") -> str:
+    return " / ".join(str(row[f"{prefix}{outcome}_percent"]) for outcome in BUILT_IN_OUTCOMES)
 
 
 _ONCE = pandas.read_csv(RESULTS / "once.csv")

@@ -19,6 +19,18 @@ from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import find_learned, learned_methods
 from tint_sumo.study.results_csv import read_csv
 from tint_sumo.study.summary import Summary, at_mixes, by_title, over_all_mixes
+from tint_sumo.traits.identification import (
+    AMONG_RUN,
+    CHANCE,
+    ICC,
+    ICC_LESS_SPEED,
+    OTHER,
+    PREDICTION,
+    PREDICTORS,
+    RANK_ONE,
+    SAME,
+    VECTORS,
+)
 from tint_sumo.traits.storage import read_card
 
 ROOT = Path(__file__).parents[1]
@@ -236,6 +248,32 @@ def test_the_page_on_calibration_has_the_measured_numbers() -> None:
     assert f"takes {measured.loc[('time IDM', 'fit of all pairs'), 'value']:.0f} s on one core" in prose
     sigma, fading_s = (measured.loc[("errors EIDM", name), "value"] for name in ("sigmaerror", "tPersDrive"))
     assert f"({sigma:.2f} and {fading_s:.2f} s;" in prose
+
+
+def test_the_page_on_real_traits_has_the_measured_numbers() -> None:
+    measured = pandas.read_csv(RESULTS / "real_traits.csv").set_index(["group", "situation", "name"])
+
+    def shown(group: str, situation: str, name: str, decimals: int = 2, scale: float = 1.0) -> str:
+        if (group, situation, name) not in measured.index:
+            return "-"
+        value, low, high = scale * measured.loc[(group, situation, name), ["value", "low", "high"]]
+        return f"{value:.{decimals}f} [{low:.{decimals}f}, {high:.{decimals}f}]"
+
+    found = _tables(DOCS / "explanation" / "real-traits.md")
+    predictions, identified, correlations = (table.strip().split("\n")[2:] for table in found)
+    for line, name in zip(predictions, PREDICTORS, strict=True):
+        cells = [
+            shown(group, situation, name)
+            for situation in (SAME, OTHER)
+            for group in (PREDICTION, f"{PREDICTION} gained")
+        ]
+        assert line == f"| {name} | {' | '.join(cells)} |"
+    for line, name in zip(identified, (*VECTORS, CHANCE), strict=True):
+        groups = ((RANK_ONE, SAME), (RANK_ONE, OTHER), (AMONG_RUN, OTHER))
+        cells = [shown(*group, name, 0, 100.0) for group in groups]
+        assert line == f"| {name} | {' | '.join(cells)} |"
+    for line, name in zip(correlations, VECTORS, strict=True):
+        assert line == f"| {name} | {shown(ICC, OTHER, name)} | {shown(ICC_LESS_SPEED, OTHER, name)} |"
 
 
 def test_the_table_of_own_networks_is_that_of_the_results() -> None:

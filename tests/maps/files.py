@@ -24,6 +24,7 @@ class Drawn:
     right: int | None = None
     sign: str | None = None
     light: int | None = None
+    opposite: Mapping[str, int] = field(default_factory=dict)  # adjacentLeft or adjacentRight
     bounds: tuple[np.ndarray, np.ndarray] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -88,6 +89,7 @@ def _commonroad_lanelet(name: int, one: Drawn) -> str:
         for tag, other in (("adjacentLeft", one.left), ("adjacentRight", one.right))
         if other is not None
     )
+    beside += "".join(f'<{tag} ref="{other}" drivingDir="opposite"/>' for tag, other in one.opposite.items())
     after = "".join(f'<successor ref="{other}"/>' for other in one.successors)
     sign = f'<trafficSignRef ref="9{one.sign}"/>' if one.sign else ""
     light = f'<trafficLightRef ref="{one.light}"/>' if one.light else ""

@@ -207,6 +207,18 @@ def test_left_hand_traffic(tmp_path: Path) -> None:
     assert not drive(found, tmp_path)
 
 
+@pytest.mark.parametrize(("y", "is_left"), [(3.5, False), (-3.5, True)])
+def test_the_side_of_traffic_is_that_of_opposite_lanelets(tmp_path: Path, y: float, is_left: bool) -> None:
+    side = "adjacentRight" if is_left else "adjacentLeft"
+    lanelets = {
+        1: Drawn([(0, 0), (50, 0)], opposite={side: 2}),
+        2: Drawn([(50, y), (0, y)], opposite={side: 1}),
+    }
+    for file in (commonroad(tmp_path / "map.xml", lanelets), lanelet2(tmp_path / "map.osm", lanelets)):
+        found = import_map(file, tmp_path / "net", overwrite=True)
+        assert (found.left_hand, found.roads) == (is_left, 2)
+
+
 def test_a_network_is_the_same_each_time_and_replaces_nothing(tmp_path: Path) -> None:
     file = commonroad(tmp_path / "map.xml")
     packed = tmp_path / "map.xml.gz"

@@ -193,6 +193,12 @@ def test_lanelets_that_end_within_a_junction_are_left_out(tmp_path: Path) -> Non
     assert found.junctions == 1
 
 
+def test_one_strip_for_both_directions_is_no_junction(tmp_path: Path) -> None:
+    both = {1: Drawn([(0, 0), (50, 0)]), 2: Drawn([(50, 0), (0, 0)])}
+    found = import_map(commonroad(tmp_path / "both.xml", both), tmp_path)
+    assert (found.roads, found.junctions, found.left_out) == (2, 0, ())
+
+
 def test_left_hand_traffic(tmp_path: Path) -> None:
     def mirrored(one: Drawn) -> Drawn:
         points = [(x, -y) for x, y in one.points]
@@ -282,6 +288,15 @@ def test_lanelet2_gives_the_same_network(crossing: ImportedMap, tmp_path: Path) 
     assert network(found).getLane("1_0").getSpeed() == pytest.approx(12.5)
     assert not network(found).hasGeoProj()
     assert not drive(found, tmp_path)
+
+
+def test_lanelets_of_others_than_vehicles_are_left_out(tmp_path: Path) -> None:
+    file = lanelet2(tmp_path / "map.osm")
+    text = file.read_text().replace('<relation id="3">', '<relation id="3"><tag k="participant:pedestrian" v="yes"/>')
+    write_text(file, text.replace('<relation id="1">', '<relation id="1"><tag k="participant:vehicle:car" v="yes"/>'))
+    lanes = lanes_of(import_map(file, tmp_path))
+    assert "1_0" in lanes
+    assert "3_0" not in lanes
 
 
 def test_right_of_way_of_lanelet2(tmp_path: Path) -> None:

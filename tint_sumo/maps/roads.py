@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from scipy.cluster.hierarchy import DisjointSet
 
 from tint_sumo.maps.lanelets import LaneletMap, Light, Line, arc_lengths, side_by_side
@@ -188,26 +187,16 @@ def _plan(pieces: Pieces) -> _Plan:
 def _inside(plan: _Plan) -> list[int]:
     """Return the pieces of roads that lie inside a junction.
 
-    They lead back to it, end in its middle, or lead in a few metres from it to where lanes join without a conflict.
+    They lead back to it, or lead in a few metres from it to where lanes join without a conflict.
     """
     found = []
     for number, chain in enumerate(plan.chains):
         start, end = plan.meeting["start", number], plan.meeting["end", number]
-        in_middle = any(
-            len(plan.ends_at(here)) == 1 and _is_within(plan, (kind, number), there)
-            for kind, here, there in (("end", end, start), ("start", start, end))
-        )
         joins = sum(kind == "end" for kind, _ in plan.ends_at(end)) > 1 and not plan.inside[end]
         is_short = plan.length_m(number) < SHORTEST_END_M and bool(plan.inside[start])
-        if start == end or in_middle or (joins and is_short):
+        if start == end or (joins and is_short):
             found += chain
     return found
-
-
-def _is_within(plan: _Plan, end: _End, node: int) -> bool:
-    """Return whether an end of a road lies in the middle of the other roads that meet at a node."""
-    others = [plan.point(other) for other in plan.ends_at(node) if other[1] != end[1]]
-    return bool(shapely.MultiPoint(others).convex_hull.contains(shapely.Point(plan.point(end))))
 
 
 def _chains(pieces: Pieces) -> list[list[int]]:

@@ -41,7 +41,7 @@ def completions(script: str, *words: str) -> list[str]:
         (["tint-sumo", "policy", "train", "--bud"], ["--budget"]),
         (["tint-sumo", "policy", "train", "--other"], ["--other-scene"]),
         (["tint-sumo", "policy", "train", "--tra"], ["--traits"]),  # its help has two lines
-        (["tint-sumo", "policy", "train", "--budget", ""], ["quick", "full", "paper"]),
+        (["tint-sumo", "policy", "train", "--budget", ""], ["quick", "full", "strangers", "paper"]),
         (["tint-sumo", "record", "--config", "x.yaml", "--wi"], ["--windows"]),
         (["tint-sumo", "--pr"], ["--print-completion"]),
     ],

@@ -114,6 +114,10 @@ def test_the_way_over_a_fork_is_the_one_that_is_taken_later(net: Path) -> None:
     assert leads.iloc[:10].all()  # still on the way of the one that turns
     np.testing.assert_allclose(found["gap_m"].iloc[:10], 5.0, atol=0.1)
     assert not leads.iloc[22:].any()  # the other is on the junction, on its way ahead
+    behind = straight(0, -50, np.pi / 2, 73)
+    straight_on = match(drawn(behind, turn), net).table.loc[lambda rows: rows["vehicle"] == "0", "leader"]
+    assert (straight_on.astype(object) == "1").iloc[:10].all()
+    assert straight_on.iloc[34:].isna().all()
 
 
 def test_what_is_not_placed_has_a_reason(net: Path) -> None:

@@ -32,7 +32,7 @@ from tint_sumo.traits.streaming import TrackStream
 SCENE = "t_intersection"
 TRAINING = "strangers"
 WORLDS = ("old", "towns", *HELD_OUT_WORLDS)
-ROUNDS = 16  # of the supervised training, each with new traffic
+ROUNDS = 8  # of the supervised training, each with new traffic
 PASSES = 3  # over the traffic of a round
 PARTS = 6  # minibatches of a round's environments
 HIDDEN = 32

@@ -1,6 +1,6 @@
 """Test policies in worlds that their training has not met; writes a table.
 
-Usage: python scripts/measure_strangers.py RUNS [--cases 300] [--out data/results/strangers.csv]
+Usage: python scripts/measure_strangers.py RUNS [--cases 200] [--out data/results/strangers.csv]
 
 RUNS is a folder of training runs METHOD.SEED, such as ``tint-sumo policy train --method oracle --world towns --budget
 strangers --seed 0 --out RUNS/oracle.0`` makes. A row of the table is a policy in a world; the rules and the shipped
@@ -22,7 +22,7 @@ from tint_sumo.methods.evaluation import BUILT_IN_OUTCOMES, evaluate
 from tint_sumo.methods.loading import Contender, load_policy
 
 WORLDS = ("old", "towns", *HELD_OUT_WORLDS)
-OTHERS = ("always_go", "ttc", "no_labels", "cross_window", "oracle")  # rules and policies of the old world
+OTHERS = ("ttc", "no_labels", "oracle")  # a rule, and policies of the old world
 CASE_SET = 600
 FIELDS = ("trained_in", "method", "seed", "world", "cases", *(f"{outcome}_percent" for outcome in BUILT_IN_OUTCOMES))
 
@@ -30,7 +30,7 @@ FIELDS = ("trained_in", "method", "seed", "world", "cases", *(f"{outcome}_percen
 def contenders(runs: Path) -> Iterator[tuple[str, str, str]]:
     """Yield the world of the training, the name of the method, and name or path of each policy; with its seed last."""
     for name in OTHERS:
-        yield "" if name in ("always_go", "ttc") else "old", name, name
+        yield "" if name == "ttc" else "old", name, name
     for folder in sorted(runs.iterdir()):
         if (folder / "policy.safetensors").exists():
             yield "towns", folder.name.split(".")[0], str(folder)
@@ -45,7 +45,7 @@ def measure(contender: Contender, world: str, cases: int) -> dict[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("runs", type=Path)
-    parser.add_argument("--cases", type=int, default=300)
+    parser.add_argument("--cases", type=int, default=200)
     parser.add_argument("--out", type=Path, default=Path("data/results/strangers.csv"))
     given = parser.parse_args()
     rows = list(csv.DictReader(given.out.read_text().splitlines())) if given.out.exists() else []

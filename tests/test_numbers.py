@@ -384,3 +384,16 @@ def _tables(page: Path) -> list[str]:
     """The tables of a page, with single spaces."""
     text = re.sub(r" +", " ", page.read_text(encoding="utf-8"))
     return [re.sub(r"-{3,}", "---", table) for table in _TABLE.findall(text)]
+
+
+def test_the_table_of_relative_traits_is_that_of_the_results() -> None:
+    (table,) = (one for one in _tables(DOCS / "explanation" / "strangers.md") if "supervised" in one)
+    head, _, *lines = table.strip().split("\n")
+    measured = pandas.read_csv(RESULTS / "relative_traits.csv").set_index(["world", "method"])
+    methods = head.strip("| ").split(" | ")[1:]
+    assert [line.split("`")[1] for line in lines] == list(dict.fromkeys(measured.index.get_level_values(0)))
+    for line in lines:
+        world, *cells = line.strip("| ").split(" | ")
+        for method, cell in zip(methods, cells, strict=True):
+            row = measured.loc[(world.strip("`"), method)]
+            assert cell == f"{100 * row['accuracy']:.1f} ({100 * row['calibration_error']:.1f})"

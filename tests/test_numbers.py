@@ -397,3 +397,23 @@ def test_the_table_of_relative_traits_is_that_of_the_results() -> None:
         for method, cell in zip(methods, cells, strict=True):
             row = measured.loc[(world.strip("`"), method)]
             assert cell == f"{100 * row['accuracy']:.1f} ({100 * row['calibration_error']:.1f})"
+
+
+def test_the_table_of_policies_among_strangers_is_that_of_the_results() -> None:
+    (table,) = (one for one in _tables(DOCS / "explanation" / "strangers.md") if "`ttc`" in one)
+    head, _, *lines = table.strip().split("\n")
+    measured = pandas.read_csv(RESULTS / "strangers.csv", keep_default_na=False, dtype={"seed": str})
+    found = measured.set_index(["world", "method", "seed", "trained_in"])
+    assert set(measured["cases"]) == {200}
+    columns = []
+    for name in head.strip("| ").split(" | ")[1:]:
+        method, _, seed = (
+            name.replace("`", "").replace("no labels, old", "no_labels old").replace(",", "").partition(" ")
+        )
+        columns.append((method, "", "old") if seed == "old" else (method, seed, "towns" if seed else ""))
+    assert len(lines) * len(columns) == len(measured)
+    for line in lines:
+        world, *cells = line.strip("| ").split(" | ")
+        for key, cell in zip(columns, cells, strict=True):
+            row = found.loc[(world.strip("`"), *key)]
+            assert cell == "/".join(f"{row[f'{outcome}_percent']:.0f}" for outcome in BUILT_IN_OUTCOMES)

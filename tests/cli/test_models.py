@@ -5,13 +5,13 @@ import pytest
 from tests.cli.calls import refuse, run
 from tint_sumo import traits
 from tint_sumo.cli import main
-from tint_sumo.methods.registry import METHODS, Learned
+from tint_sumo.methods.registry import METHODS, Learned, built_in_methods
 
 
 def test_models_are_listed_and_shown(capsys: pytest.CaptureFixture[str]) -> None:
     models = run(capsys, "models")["models"]
     kinds = {kind: {one["name"] for one in models if one["kind"] == kind} for kind in ("trait model", "policy")}
-    learned = {name for name, method in METHODS.items() if isinstance(method, Learned)}
+    learned = {name for name in built_in_methods() if isinstance(METHODS[name], Learned)}
     assert kinds == {"trait model": set(traits.TRAIT_METHODS), "policy": learned}
     assert {one["scene"] for one in models} == {"t_intersection"}
     assert all("% of windows" in one["result"] or one["result"].startswith("success ") for one in models)

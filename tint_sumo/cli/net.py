@@ -11,6 +11,8 @@ from tint_sumo.cli.values import Scene, optional
 from tint_sumo.core.ranges import Range
 
 _FORMAT = optional("NAME", "Format: commonroad, lanelet2, opendrive or osm.", "recognised by the contents")
+_Latitude = Annotated[float, Range(-90.0, 90.0)]
+_Longitude = Annotated[float, Range(-180.0, 180.0)]
 _ORIGIN = optional(
     "LATITUDE LONGITUDE",
     "Degrees of x = y = 0 in a lanelet2 map.",
@@ -49,7 +51,7 @@ class ImportNet(Command):
     """Folder for the network and its plain XML."""
     format: Annotated[str | None, _FORMAT] = None
     left_hand: Annotated[Literal["true", "false"] | None, _LEFT_HAND] = None
-    origin: Annotated[tuple[float, float] | None, _ORIGIN] = None
+    origin: Annotated[tuple[_Latitude, _Longitude] | None, _ORIGIN] = None
     overwrite: bool = False
     """Replace files of the same names."""
 

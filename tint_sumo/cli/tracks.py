@@ -9,6 +9,7 @@ from tyro.conf import Positional, Suppress, subcommand
 from tint_sumo.cli.command import Command, Outcome, wrote
 from tint_sumo.cli.values import optional
 from tint_sumo.core.files import PICTURE_SUFFIXES, require_output_file
+from tint_sumo.core.ranges import Range
 
 _FORMAT = optional(
     "NAME",
@@ -19,6 +20,7 @@ _FORMAT = optional(
 _FIGURE = optional("FILE", "Picture to write: .png, .jpg, .webp, .svg or .pdf.")
 _TABLE = optional("FILE", "Table to write, a row for each of the tracks: .parquet or .csv.")
 _TABLE_SUFFIXES = (".parquet", ".csv")
+_Shift = Annotated[float, Range(-1e8, 1e8)]  # more than twice around the Earth
 TrackFormatName = Annotated[str | None, _FORMAT]
 
 
@@ -56,7 +58,7 @@ class MatchTracks(Command):
     out: Annotated[Path | None, _TABLE] = None
     figure: Annotated[Path | None, _FIGURE] = None
     format: TrackFormatName = None
-    shift_m: tuple[float, float] = (0.0, 0.0)
+    shift_m: tuple[_Shift, _Shift] = (0.0, 0.0)
     """Added to x and y of the tracks, m."""
 
     def run(self) -> Outcome:

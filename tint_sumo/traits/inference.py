@@ -100,7 +100,7 @@ def infer_recorded(source: Path, model: str | Path, format_name: str | None = No
         (farthest, *_) = outside_lines(table)
         raise InputError(
             f"{percent(float(table[OUTSIDE].mean()))}% of the windows of {source} lie outside what {model} was trained "
-            f"on ({farthest.strip()}); train a model on such tracks: tint-sumo traits train --tracks"
+            f"on ({farthest.strip()}); train a model on such `tracks` with tint-sumo traits train"
         )
     return table
 

@@ -126,6 +126,8 @@ def test_what_is_not_placed_has_a_reason(net: Path) -> None:
     found = summary(matched)
     assert (found["placed_rows"], found["vehicles_placed_nowhere"], found["vehicles_placed_in_part"]) == (3, 2, 0)
     assert "3 far from all lanes, 3 across or against the lanes" in report(matched)
+    assert "is this the network of these tracks?" in report(matched)
+    assert "is this the network" not in report(match(drawn(straight(-50, -1.75, 0.0, 3)), net))
     assert matched.table["lane"].isna().tolist() == [True] * 6 + [False] * 3
 
 

@@ -14,6 +14,7 @@ from tint_sumo.tracks.matching import REASONS, Matched
 
 _COLOURS = {"": "#2a78b5", REASONS[0]: "#c0392b", REASONS[1]: "#e08a1e"}
 _POINTS = 200_000  # that are drawn at most
+_DOUBTFUL = 0.5  # a smaller share of placed rows is worth a warning
 
 
 def summary(matched: Matched) -> dict[str, Any]:
@@ -57,6 +58,8 @@ def report(matched: Matched) -> str:
         f"leaders           in {found['rows_with_leader']:,} rows"
         + (f", {found['gap_median_m']:.1f} m ahead in the median" if found["gap_median_m"] is not None else ""),
     ]
+    if found["placed_rows"] < _DOUBTFUL * found["rows"]:
+        lines.append("doubtful          is this the network of these tracks? `shift_m` moves them")
     return "\n".join(lines)
 
 

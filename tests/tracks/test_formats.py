@@ -183,7 +183,15 @@ def test_levelx_needs_its_meta_data(tmp_path: Path) -> None:
         read_tracks(file)
 
 
-@pytest.mark.parametrize("text", ["", "a,b\n1,2\n", "<routes/>", "\x00\x01"])
+@pytest.mark.parametrize("text", ["", "\n \n", "\ufeff\n"])
+@pytest.mark.parametrize("suffix", ["", ".gz"])
+def test_empty_files_are_called_so(tmp_path: Path, text: str, suffix: str) -> None:
+    (tmp_path / f"file.csv{suffix}").write_bytes(gzip.compress(text.encode()) if suffix else text.encode())
+    with pytest.raises(InputError, match="is empty; give a recording of traffic"):
+        read_tracks(tmp_path / f"file.csv{suffix}")
+
+
+@pytest.mark.parametrize("text", ["a,b\n1,2\n", "<routes/>", "\x00\x01"])
 def test_unknown_files_are_refused(tmp_path: Path, text: str) -> None:
     write_text(tmp_path / "file.csv", text)
     with pytest.raises(InputError, match="has the columns or elements of no known format"):

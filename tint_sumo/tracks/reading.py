@@ -124,6 +124,8 @@ def recording_name(file: Path) -> str:
 def _head(file: Path) -> Head:
     with opened(file) as content:
         head = content.read(_HEAD_BYTES)
+    if not head.strip(b"\xef\xbb\xbf \t\r\n"):
+        raise InputError(f"{file} is empty; give a recording of traffic")
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"{file} is text in UTF-16; save it in UTF-8")
     return Head(file, head.decode("utf-8", "replace"))

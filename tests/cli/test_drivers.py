@@ -32,7 +32,7 @@ def test_fit_reports_the_population_and_writes_it(fit: Path, capsys: pytest.Capt
 
 def test_bad_recordings_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, text, message in (
-        ("empty.csv", "", "known format"),
+        ("empty.csv", "", "is empty"),
         (
             "short.csv",
             "run_no,leader_id,follower_id,xLeaderReal,xFollowerReal\n1,2,3,4,5\n",

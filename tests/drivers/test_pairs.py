@@ -123,7 +123,7 @@ def test_a_folder_is_read_file_by_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda text: "", "no known format"),
+        (lambda text: "", "is empty"),
         (lambda text: HEADER + "\n", "no vehicles"),
         (lambda text: text.replace("vFollowerReal", "v"), "lacks the column vFollowerReal"),
         (lambda text: text + text.splitlines()[5] + "\n", "more than once"),

@@ -1,12 +1,13 @@
-# make install | study | test | test-long | lint | coverage | mutants | docs | net | clean
+# make install | study | test | test-long | lint | coverage | mutants | docs | net | dist | clean
 # Another build of torch: make install TORCH=torch
 # Another Python, with an environment of its own beside .venv: make test PYTHON=python3.12
 PYTHON ?= python3
 VENV ?= .venv$(if $(filter-out python3,$(PYTHON)),-$(subst /,-,$(PYTHON:/%=%)))
 TORCH ?=
 BIN := $(VENV)/bin
+DIST := dist
 
-.PHONY: install study test test-long lint coverage mutants docs net clean
+.PHONY: install study test test-long lint coverage mutants docs net dist clean
 
 install: $(VENV)/.installed
 
@@ -49,6 +50,12 @@ docs: install
 
 net: install
 	$(BIN)/tint-sumo net --out sumo_net
+
+dist: install
+	rm -rf $(DIST)
+	$(BIN)/hatchling build --directory $(DIST)
+	$(BIN)/twine check --strict $(DIST)/*
+	$(BIN)/check-wheel-contents $(DIST)/*.whl
 
 clean:
 	rm -rf runs build dist .coverage* .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -6,12 +6,15 @@ import re
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import tomllib
 import venv
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from packaging.utils import canonicalize_name
 
 import tint_sumo
 from tint_sumo.core.files import write_text
@@ -20,11 +23,21 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
-    subprocess.run([*build, "--wheel-dir", str(folder), str(ROOT)], check=True)
-    return next(folder.glob("*.whl"))
+def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the wheel and the source distribution, made and checked by ``make dist``."""
+    folder = tmp_path_factory.mktemp("dist")
+    installed = f"{sys.prefix}/.installed"  # whether it is up to date is not the question here
+    command = ["make", "dist", f"DIST={folder}", f"VENV={sys.prefix}", f"--old-file={installed}"]
+    made = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stdout + made.stderr
+    assert made.stdout.count("PASSED") == 2 and ".whl: OK" in made.stdout
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(dist: Path) -> Path:
+    (file,) = dist.glob("*.whl")
+    return file
 
 
 def test_the_wheel_holds_network_models_and_type_marker(wheel: Path) -> None:
@@ -35,20 +48,59 @@ def test_the_wheel_holds_network_models_and_type_marker(wheel: Path) -> None:
     for file in models.rglob("*.*"):
         assert f"tint_sumo/shipped/models/{file.relative_to(models).as_posix()}" in names
     assert "tint_sumo/py.typed" in names
-    assert not [name for name in names if name.endswith(".pth")]  # nothing runs when Python starts
+    assert [name for name in names if name.endswith(".dist-info/licenses/LICENSE")]
+    assert not [name for name in names if name.endswith((".pth", ".pyc"))]  # nothing runs when Python starts
+    assert wheel.stat().st_size < 8e6
 
 
-def test_the_wheel_works_in_a_fresh_environment(wheel: Path, tmp_path: Path) -> None:
-    """Started in an empty folder; the dependencies alone are those of this environment."""
-    fresh, empty = tmp_path / "fresh", tmp_path / "empty"
-    empty.mkdir()
-    venv.create(fresh)
-    python = fresh / "bin" / "python"
-    pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps"]
+def test_the_source_distribution_holds_what_the_wheel_is_made_of_and_no_more(
+    dist: Path, wheel: Path, tmp_path: Path
+) -> None:
+    (file,) = dist.glob("*.tar.gz")
+    assert file.stat().st_size < 8e6
+    with tarfile.open(file) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (source,) = tmp_path.iterdir()
+    assert {path.name for path in source.iterdir() if path.is_dir()} == {"tint_sumo", "sumo_net", "data"}
+    assert {path.name for path in (source / "data").iterdir()} == {"models"}
+    build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel"]
+    subprocess.run(build, cwd=source, capture_output=True, check=True)
+    assert (source / "dist" / wheel.name).read_bytes() == wheel.read_bytes()
+
+
+@dataclass(frozen=True)
+class Fresh:
+    """A fresh environment with the wheel; the dependencies alone are those of this one."""
+
+    folder: Path
+
+    @property
+    def site(self) -> Path:
+        (site,) = self.folder.glob("lib/python*/site-packages")
+        return site
+
+    def run(self, program: str, *arguments: str, cwd: Path, **variables: str) -> str:
+        """Return what a program of the environment prints."""
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | variables
+        command = [str(self.folder / "bin" / program), *arguments]
+        result = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+        assert result.returncode == 0, result.stderr
+        return result.stdout
+
+
+@pytest.fixture(scope="module")
+def fresh(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Fresh:
+    made = Fresh(tmp_path_factory.mktemp("fresh"))
+    venv.create(made.folder)
+    pip = [sys.executable, "-m", "pip", "--python", str(made.folder / "bin" / "python"), "install", "--quiet"]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    subprocess.run([*pip, str(wheel)], env=environment, check=True)
-    (site,) = fresh.glob("lib/python*/site-packages")
-    (site / "dependencies.pth").write_text(f"import site; site.addsitedir({sysconfig.get_path('purelib')!r})")
+    subprocess.run([*pip, "--no-deps", str(wheel)], env=environment, check=True)
+    dependencies = f"import site; site.addsitedir({sysconfig.get_path('purelib')!r})"
+    (made.site / "dependencies.pth").write_text(dependencies)
+    return made
+
+
+def test_the_wheel_works_in_a_fresh_environment(fresh: Fresh, tmp_path: Path) -> None:
     code = """
 import gymnasium
 env = gymnasium.make("tint_sumo:tint_sumo/TIntersection-v1")
@@ -58,14 +110,60 @@ import tint_sumo.core.files, tint_sumo.traits
 assert (tint_sumo.core.files.shipped("sumo_net") / "tint.net.xml").exists()
 print(tint_sumo.__file__, tint_sumo.core.files.shipped("models"), tint_sumo.traits.load("vae").latent_size)
 """
-    for command, expected in (
-        ([str(fresh / "bin" / "tint-sumo"), "--help"], "usage: tint-sumo"),
-        ([str(python), "-c", code], f"{site}/tint_sumo/__init__.py {site}/tint_sumo/shipped/models 2"),
-    ):
-        result = subprocess.run(command, cwd=empty, env=environment, capture_output=True, text=True, check=False)
-        assert result.returncode == 0, result.stderr
-        assert result.stdout.startswith(expected)
-    assert not list(empty.iterdir())
+    expected = f"{fresh.site}/tint_sumo/__init__.py {fresh.site}/tint_sumo/shipped/models 2\n"
+    assert fresh.run("python", "-c", code, cwd=tmp_path) == expected
+    assert not list(tmp_path.iterdir())
+
+
+def test_pipx_and_uvx_find_the_command_by_the_name_of_the_package(wheel: Path) -> None:
+    """Both look for a program with the name that was typed, which the index holds in its normal form."""
+    with zipfile.ZipFile(wheel) as archive:
+        (points,) = (archive.read(name).decode() for name in archive.namelist() if name.endswith("entry_points.txt"))
+    commands = re.findall(r"^(\S+) = ", points, re.MULTILINE)
+    assert commands == [canonicalize_name(wheel.name.split("-", maxsplit=1)[0])]
+
+
+FIRST_TYPED = [
+    ("--help",),
+    ("--version",),
+    ("models",),
+    ("models", "cross_window"),
+    pytest.param(
+        ("policy", "evaluate", "--model", "oracle", "--p-conservative", "0.4", "--episodes", "2"),
+        marks=pytest.mark.long,
+    ),
+]
+
+
+@pytest.mark.parametrize("arguments", FIRST_TYPED, ids=" ".join)
+def test_first_commands_need_no_folder_that_they_may_write_to(
+    fresh: Fresh, arguments: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Even root cannot write to ``/proc``."""
+    assert fresh.run("tint-sumo", *arguments, cwd=Path("/proc"), HOME="/proc", TMPDIR=str(tmp_path))
+    assert {path.name.split("_")[0] for path in tmp_path.iterdir()} <= {"torchinductor"}  # an empty one of torch
+
+
+FIRST_WRITTEN = [
+    ("net", "--out", "asked"),
+    pytest.param(("record", "--out", "asked", "--windows", "100", "--p-conservative", "0.5"), marks=pytest.mark.long),
+    pytest.param(
+        ("render", "--model", "always_go", "--p-conservative", "0.4", "--case", "0", "--out", "asked/case.png"),
+        marks=pytest.mark.long,
+    ),
+]
+
+
+@pytest.mark.parametrize("arguments", FIRST_WRITTEN, ids=lambda arguments: arguments[0])
+def test_commands_write_what_is_asked_and_nothing_beside_it(
+    fresh: Fresh, arguments: tuple[str, ...], tmp_path: Path
+) -> None:
+    here, home, scratch = (tmp_path / name for name in ("here", "home", "scratch"))
+    for folder in (here, home, scratch):
+        folder.mkdir()
+    fresh.run("tint-sumo", *arguments, cwd=here, HOME=str(home), TMPDIR=str(scratch))
+    assert [path.name for path in here.iterdir()] == ["asked"] and any((here / "asked").iterdir())
+    assert not list(home.iterdir()) and not list(scratch.iterdir())
 
 
 def test_the_version_is_the_same_everywhere() -> None:

@@ -66,9 +66,7 @@ class Supervised(nn.Module):
         """Return logits (T, N, V) from what has been seen up to each step."""
         steps, envs, slots = seen.present.shape
         present = torch.from_numpy(seen.present)
-        begins = np.ones_like(seen.present)
-        same = (seen.track[:-1] == seen.track[1:]) & ~seen.begins[1:, :, None]
-        begins[1:] = ~(seen.present[:-1] & seen.present[1:] & same)
+        begins = seen.begins_track | ~seen.present
         moved = np.zeros_like(seen.position_m)
         moved[1:] = np.where(begins[1:], 0.2, np.diff(seen.position_m, axis=0))
         features = np.stack([(moved - 0.2) / 0.1, (np.minimum(seen.gap_m, NO_LEADER_GAP_M) - 8.0) / 6.0], axis=-1)

@@ -60,7 +60,7 @@ Positions = dict[tuple[str, int], float]  # x of a vehicle's centre by its name 
 
 @dataclass(frozen=True)
 class Drive:
-    """What came of an ego's drive."""
+    """Outcome of an ego's drive, its length, and where the others were."""
 
     outcome: str
     steps: int

@@ -2,7 +2,7 @@
 
 import ctypes
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import cache
 
 import torch
@@ -11,28 +11,25 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 _KEPT_BYTES = 2**30
 
 
-@contextmanager
-def wide_products(wanted: bool = True) -> Iterator[None]:
+def wide_products(wanted: bool = True) -> AbstractContextManager[None]:
     """Let torch multiply large float32 matrices with oneDNN in the block, where that stays float32.
 
     torch prefers MKL, which uses AVX-512 on Intel's processors alone: on an AMD EPYC, oneDNN is twice as fast. The only
     switch for it is a lower precision, which oneDNN makes use of where a processor has units for it (AMX); there, and
     where ``wanted`` is false, nothing changes. oneDNN compiles code for every shape, so shapes should be few.
     """
-    before = torch.get_float32_matmul_precision()
-    if wanted and _stays_float32():
-        torch.set_float32_matmul_precision("medium")
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
+    return _precision("medium") if wanted and _stays_float32() else nullcontext()
+
+
+def narrow_products() -> AbstractContextManager[None]:
+    """Let torch multiply float32 matrices with MKL in the block: small products wait less for it."""
+    return _precision("highest")
 
 
 @contextmanager
-def narrow_products() -> Iterator[None]:
-    """Let torch multiply float32 matrices with MKL in the block: small products wait less for it."""
+def _precision(name: str) -> Iterator[None]:
     before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("highest")
+    torch.set_float32_matmul_precision(name)
     try:
         yield
     finally:
@@ -42,13 +39,9 @@ def narrow_products() -> Iterator[None]:
 @cache
 def _stays_float32() -> bool:
     """Return whether oneDNN keeps all digits of numbers that bfloat16 and TF32 would round."""
-    before = torch.get_float32_matmul_precision()
     values = torch.full((256, 256), 1.0 + 2.0**-20)
-    torch.set_float32_matmul_precision("medium")
-    try:
+    with _precision("medium"):
         return torch.equal(values @ torch.eye(256), values)
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 @cache

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 from tempfile import TemporaryFile
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -14,6 +14,9 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.provenance import CONFIG_FILE, PROVENANCE_FILE, made_by, present_origin
 from tint_sumo.core.reading import JSON_BYTES, read_file
 from tint_sumo.core.structures import FieldError, build_json, dotted
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 T = TypeVar("T")
 
@@ -65,6 +68,21 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
+
+
+def write_frame(table: "DataFrame", path: Path, float_format: str | None = None) -> None:
+    """Write a table without its index as .csv, or else as Parquet, whole or not at all.
+
+    Args:
+        table: to write.
+        path: of the file.
+        float_format: of numbers in CSV, such as ``"%.6f"``; as short as they can be if not given.
+    """
+    with whole_file(path) as partial:
+        if path.suffix.lower() == ".csv":
+            table.to_csv(partial, index=False, float_format=float_format)
+        else:
+            table.to_parquet(partial, index=False)
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:

@@ -137,7 +137,7 @@ def _index(
 
 @dataclass(frozen=True)
 class _Rule:
-    """What a regulatory element says of the lanelets that name it."""
+    """Right of way, lights and speed limit that a regulatory element gives the lanelets that name it."""
 
     kind: str  # subtype
     yields: Collection[str]

@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from tint_sumo.config import LATENT_SIZE, PERFECT, Mix, PpoSettings, Sensor, Tra
 from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import InputError, NotFiniteError
 from tint_sumo.core.files import shipped
-from tint_sumo.core.structures import FieldError, build
+from tint_sumo.core.structures import build
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.perceived import perceived_in
 from tint_sumo.methods.registry import METHODS, Learned, Policy, Rule, find_learned
@@ -231,11 +232,11 @@ def _checked_card(stem: Path) -> dict[str, Any]:
     method = METHODS.get(str(card.get("method")))
     settings = card.get("settings")
     mix = card.get("p_conservative")
-    fits = isinstance(method, Learned) and (_is_mix(mix) or (mix is None and "scene_settings" in card))
+    fits = isinstance(method, Learned) and (_can(Mix.parse, mix) or (mix is None and "scene_settings" in card))
     fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
-    fits &= isinstance(settings, dict) and _is_observation(settings)
+    fits &= isinstance(settings, dict) and _can(_observation_settings, settings)
     fits &= "scene_settings" in card or str(card.get("scene")) in (*SCENES, ALL_SCENES)
-    fits &= _is_sensor(card.get("sensor", {}))
+    fits &= _can(partial(build, Sensor), card.get("sensor", {}))
     if not fits or (isinstance(method, Learned) and method.encoder and not _is_file_name(card.get("traits"))):
         raise InputError(f"{card_file(stem)} is not the card of a policy; restore the file or train the policy again")
     return card
@@ -252,26 +253,11 @@ def _observation_settings(settings: dict[str, Any]) -> PpoSettings:
     return observed
 
 
-def _is_observation(settings: dict[str, Any]) -> bool:
+def _can(read: Callable[[Any], object], value: object) -> bool:
+    """Return whether a value can be read so, without an InputError."""
     try:
-        _observation_settings(settings)
-    except FieldError:
-        return False
-    return True
-
-
-def _is_mix(value: object) -> bool:
-    try:
-        Mix.parse(value)
+        read(value)
     except InputError:
-        return False
-    return True
-
-
-def _is_sensor(value: object) -> bool:
-    try:
-        build(Sensor, value)
-    except FieldError:
         return False
     return True
 

@@ -14,7 +14,7 @@ from tint_sumo.replay.recordings import Placed, is_on_foot
 from tint_sumo.replay.routes import Routes, is_on_edge
 from tint_sumo.scenes.geometry import Boxes, Floats, clearance_m, new_boxes
 from tint_sumo.scenes.replay import NO_TRACK, Recording, ReplayCase, Way
-from tint_sumo.scenes.sumocfg import measure_route
+from tint_sumo.scenes.sumocfg import measure_route, require_on_route
 
 _LEAST_WAY_M = 10.0  # of an ego
 _BEFORE_END_M = 1.0  # who drives just as recorded comes to the goal before the recording ends
@@ -167,11 +167,7 @@ def _any_touch(boxes: Boxes, others: Boxes) -> bool:
 def _on_edges(ego: EgoOnEdges, number: int, recording: Recording, routes: Routes, step_s: float) -> list[ReplayCase]:
     """Return the cases of an ego on given edges in a recording, at whose begin it has room."""
     edge_start_m, spans_m, length_m = measure_route(routes.net, ego.edges)
-    if not 0.0 <= ego.start_m < ego.goal_m <= length_m or not any(a <= ego.start_m <= b for a, b in spans_m):
-        raise InputError(
-            f"the ego's start ({ego.start_m:g} m) and goal ({ego.goal_m:g} m) must lie on its route one behind the "
-            f"other, from 0 to {length_m:.1f} m, and its start on no junction"
-        )
+    require_on_route(ego.start_m, ego.goal_m, spans_m, length_m)
     edge = max(index for index, start_m in enumerate(edge_start_m) if start_m <= ego.start_m)
     lane = routes.net.getEdge(ego.edges[edge]).getLanes()[0]
     way = _way_along(ego, routes)

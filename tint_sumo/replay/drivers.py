@@ -1,4 +1,4 @@
-"""How recorded vehicles drive on once they are released: with SUMO's defaults, with one model for all, or as fitted."""
+"""Drivers of recorded vehicles that are released: SUMO's defaults, one model for all, or each as fitted."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -58,7 +58,7 @@ class ReplayEnv(SceneEnv):
     route, or touches another vehicle (``collision``). Truncation: the time limit or the recording's end (``timeout``),
     or SUMO takes the ego off the road (``lost``).
 
-    What is wrong in the recording, or between it and the network, is never the ego's outcome. Vehicles that touch the
+    Faults of the recording, or between it and the network, are never the ego's outcome. Vehicles that touch the
     recorded vehicle in whose place the ego is, or that would appear on the ego, are left out. Vehicles that are on no
     lane, more than 1.5 m beyond its border, are neither seen nor touched while they are. Both are counted:
 

@@ -16,14 +16,12 @@ from tint_sumo.replay.drivers import AnyDrivers, attributes_of, find_drivers, ty
 from tint_sumo.replay.recordings import read_recordings, vehicle_classes
 from tint_sumo.replay.routes import Routes
 from tint_sumo.scenes.replay import Recording, ReplayCase, ReplayScene
+from tint_sumo.scenes.scene import require_whole_milliseconds
 from tint_sumo.scenes.sumo_config import SumoConfig
 from tint_sumo.scenes.sumo_run import require_loads
-from tint_sumo.scenes.sumocfg import SumocfgScene, read_net
+from tint_sumo.scenes.sumocfg import SumocfgScene, controller_up_to, read_net, sight_of
 from tint_sumo.tracks.reading import read_tracks
 from tint_sumo.tracks.schema import Tracks
-
-_MILLISECOND_PART = 1e-6  # by which rounding may make a step differ from whole milliseconds
-_SIGHT_S = 5.0  # the ego sees as far as it drives in this time
 
 
 def from_tracks(
@@ -63,8 +61,7 @@ def from_tracks(
     options = (("net-file", str(Path(net).absolute())), ("step-length", f"{step_s:g}"), ("time-to-teleport", "-1"))
     config = SumoConfig(Path(net).absolute(), options, ())
     require_loads(config)
-    top_mps = max(routes.limit_mps(case.route) for case in cases)
-    driven = controller or EgoController((0.0, top_mps / 2, top_mps))
+    driven = controller or controller_up_to(max(routes.limit_mps(case.route) for case in cases))
     if yields and not any(name in recording.vehicles for recording in recordings for name in yields):
         raise InputError(f"yields names none of the recorded vehicles, but {next(iter(yields))!r}; use their names")
     return ReplayScene(
@@ -73,7 +70,7 @@ def from_tracks(
         vtypes=labels,
         **ReplayScene.task_of(cases[0]),
         max_vehicles=max_vehicles,
-        sight_m=max(SumocfgScene.sight_m, _SIGHT_S * driven.desired_speeds_mps[-1]) if sight_m is None else sight_m,
+        sight_m=sight_of(driven) if sight_m is None else sight_m,
         warm_up_s=0.0,
         controller=driven,
         ego_control=ego_control,
@@ -107,8 +104,7 @@ def _require_arguments(net: Any, tracks: Any, reactive: Any, yields: Any, step_s
         if not isinstance(value, kinds):
             raise InputError(f"{name} must be {wanted}, not {shown(value)}")
     get_args(StepS)[1].require("step_s", step_s)
-    if abs(step_s * 1000 - round(step_s * 1000)) > _MILLISECOND_PART:
-        raise InputError(f"step_s must be whole milliseconds, not {step_s}")
+    require_whole_milliseconds(step_s)
 
 
 def _digest(recordings: Sequence[Recording], cases: Sequence[ReplayCase]) -> str:

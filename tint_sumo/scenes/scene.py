@@ -102,8 +102,7 @@ class Scene:
             raise InputError(f"the ego's goal ({goal_m:g} m) must lie beyond its start ({start_m:g} m)")
         require_ranges(self)
         require_scene_name(self.name)
-        if abs(self.step_s * 1000 - round(self.step_s * 1000)) > 1e-6:
-            raise InputError(f"step_s must be whole milliseconds, not {self.step_s}")
+        require_whole_milliseconds(self.step_s)
         for profile in self.population.profiles:
             if profile.desired_speed_mps[1] > self.network.speed_limit_mps:
                 raise InputError(
@@ -160,6 +159,12 @@ class Scene:
     def digest(self) -> str:
         """Digest of the roads, the vehicles and the ego's task; drivers, their mix and buildings do not count."""
         return scene_digest(self)
+
+
+def require_whole_milliseconds(step_s: float) -> None:
+    """Raise InputError unless a step has whole milliseconds, as SUMO counts them."""
+    if abs(step_s * 1000 - round(step_s * 1000)) > 1e-6:
+        raise InputError(f"step_s must be whole milliseconds, not {step_s}")
 
 
 def require_scene_name(name: str) -> None:

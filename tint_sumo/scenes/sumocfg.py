@@ -210,14 +210,7 @@ def from_sumocfg(
     net = read_net(config.net_file)
     require_loads(config)
     edge_start_m, spans_m, length_m = measure_route(net, tuple(ego_route))
-    if not 0.0 <= start_m < goal_m <= length_m:
-        raise InputError(
-            f"the ego's start ({start_m:g} m) and goal ({goal_m:g} m) must lie on its route one behind the other, "
-            f"from 0 to {length_m:.1f} m"
-        )
-    if not any(first_m <= start_m <= last_m for first_m, last_m in spans_m):
-        ends = ", ".join(f"{first_m:.1f} to {last_m:.1f}" for first_m, last_m in spans_m)
-        raise InputError(f"the ego's start ({start_m:g} m) is on a junction; its route's edges are at {ends} m")
+    require_on_route(start_m, goal_m, spans_m, length_m)
     driven = controller or controller_for(net, tuple(ego_route))
     return SumocfgScene(
         name=config.name,
@@ -228,7 +221,7 @@ def from_sumocfg(
         goal_m=float(goal_m),
         route_edge_start_m=edge_start_m,
         max_vehicles=max_vehicles,
-        sight_m=max(SumocfgScene.sight_m, _SIGHT_S * driven.desired_speeds_mps[-1]) if sight_m is None else sight_m,
+        sight_m=sight_of(driven) if sight_m is None else sight_m,
         warm_up_s=warm_up_s,
         warm_up_spread_s=warm_up_spread_s,
         warm_starts=warm_starts,
@@ -263,8 +256,36 @@ def _in_order(perceives: Any) -> tuple[Perceivable, ...]:
 
 def controller_for(net: Any, edges: tuple[str, ...]) -> EgoController:
     """Return a controller with nothing, half and all of the highest speed limit on a route as desired speeds."""
-    limit_mps = max(float(net.getEdge(edge).getSpeed()) for edge in edges)
+    return controller_up_to(max(float(net.getEdge(edge).getSpeed()) for edge in edges))
+
+
+def controller_up_to(limit_mps: float) -> EgoController:
+    """Return a controller with nothing, half and all of a speed limit as desired speeds."""
     return EgoController((0.0, limit_mps / 2, limit_mps))
+
+
+def sight_of(controller: EgoController) -> float:
+    """Return how far an ego sees by default, in m: 50, or as far as it drives in 5 s if that is more."""
+    return max(SumocfgScene.sight_m, _SIGHT_S * controller.desired_speeds_mps[-1])
+
+
+def require_on_route(start_m: float, goal_m: float, spans_m: Sequence[tuple[float, float]], length_m: float) -> None:
+    """Raise InputError unless an ego's start and goal are on its route, one behind the other.
+
+    Args:
+        start_m: of the ego's front.
+        goal_m: of its front.
+        spans_m: where the route's edges begin and end, between its junctions.
+        length_m: of the route.
+    """
+    if not 0.0 <= start_m < goal_m <= length_m:
+        raise InputError(
+            f"the ego's start ({start_m:g} m) and goal ({goal_m:g} m) must lie on its route one behind the other, "
+            f"from 0 to {length_m:.1f} m"
+        )
+    if not any(first_m <= start_m <= last_m for first_m, last_m in spans_m):
+        ends = ", ".join(f"{first_m:.1f} to {last_m:.1f}" for first_m, last_m in spans_m)
+        raise InputError(f"the ego's start ({start_m:g} m) is on a junction; its route's edges are at {ends} m")
 
 
 def read_net(file: Path, *, with_internal: bool = True) -> Any:

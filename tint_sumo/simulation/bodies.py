@@ -146,6 +146,12 @@ def box_of(sight: Mapping[int, Any], size_m: tuple[float, float], origin_m: tupl
     return (x_m, y_m, heading_x, heading_y, *size_m)
 
 
+def record_of(box: Box) -> np.void:
+    """Return a box as a record of ``tint_sumo.scenes.geometry.BOX``."""
+    record: np.void = np.array([box], BOX)[0]
+    return record
+
+
 def _stretch(shape: tuple[Point, ...], length_m: float) -> float:
     """Return the drawn length of a lane over its length in SUMO."""
     drawn_m = sum(math.dist(a, b) for a, b in pairwise(shape))

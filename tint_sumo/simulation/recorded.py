@@ -16,6 +16,7 @@ from libsumo import constants
 
 from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers, clearance_m, find_meetings, find_overlaps
 from tint_sumo.scenes.replay import NO_TRACK, ReplayScene
+from tint_sumo.simulation.bodies import box_of, record_of
 from tint_sumo.simulation.connection import SUMO_ERRORS, Connection
 from tint_sumo.simulation.ego_way import EGO
 
@@ -130,7 +131,7 @@ class RecordedTraffic:
         return found
 
     def faults(self) -> Faults:
-        """Return what has been wrong in the episode so far."""
+        """Return the faults of the episode so far."""
         return Faults(len(self._left_out), self._off_road, len(self._overlapped), len(self._touched))
 
     # Following
@@ -303,14 +304,9 @@ class RecordedTraffic:
 
     def _box_of(self, track: int) -> Any:
         """Return the box of a released vehicle in the network's frame, a record."""
-        sight = self._sight_of(track)
-        row = self._recording.box[self._rows_of(track)][:1].copy()
-        x_m, y_m, _ = sight[constants.VAR_POSITION3D]
-        angle_rad = math.radians(sight[constants.VAR_ANGLE])
-        row["heading_x"], row["heading_y"] = math.sin(angle_rad), math.cos(angle_rad)
-        row["x_m"] = x_m - row["length_m"] / 2 * row["heading_x"]
-        row["y_m"] = y_m - row["length_m"] / 2 * row["heading_y"]
-        return row[0]
+        recorded = self._recording.box[self._recording.first_row[track]]
+        size_m = float(recorded["length_m"]), float(recorded["width_m"])
+        return record_of(box_of(self._sight_of(track), size_m, (0.0, 0.0)))
 
     # Faults
 

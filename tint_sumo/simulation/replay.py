@@ -3,13 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from libsumo import constants
 
 from tint_sumo.config import Backend
-from tint_sumo.scenes.geometry import BOX
 from tint_sumo.scenes.replay import ReplayCase, ReplayScene
-from tint_sumo.simulation.bodies import box_of
+from tint_sumo.simulation.bodies import box_of, record_of
 from tint_sumo.simulation.ego_way import EGO
 from tint_sumo.simulation.recorded import Faults, RecordedTraffic
 from tint_sumo.simulation.sumocfg import Sight, SumocfgSimulation
@@ -36,7 +34,7 @@ class ReplaySimulation(SumocfgSimulation):
 
     @property
     def faults(self) -> Faults:
-        """What has been wrong in the recording, or between it and the network, in this episode."""
+        """Faults of the recording in this episode, or between it and the network."""
         return self._traffic.faults()
 
     @property
@@ -90,9 +88,8 @@ class ReplaySimulation(SumocfgSimulation):
             constants.VAR_DISTANCE: vehicle.getDistance(EGO),
             constants.VAR_SPEED: vehicle.getSpeed(EGO),
         }
-        box = np.zeros(1, BOX)
-        box[0] = box_of(ego, self._ego_size_m, (0.0, 0.0))
-        return {EGO: ego, **self._traffic.seen(box[0], front_m, self.scene.sight_m)}
+        box = record_of(box_of(ego, self._ego_size_m, (0.0, 0.0)))
+        return {EGO: ego, **self._traffic.seen(box, front_m, self.scene.sight_m)}
 
     def _in_sight(self, seen: Mapping[str, Sight], front_m: tuple[float, float, float]) -> dict[str, Sight]:  # noqa: ARG002 - they are chosen already
         return dict(seen)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.core.compiling import compiled
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.files import whole_file
+from tint_sumo.core.files import write_frame
 from tint_sumo.tracks.lanes import Lanes, Reach, reach, read_lanes
 from tint_sumo.tracks.leaders import find_leaders, named
 from tint_sumo.tracks.schema import Tracks
@@ -273,8 +273,4 @@ def _table(tracks: Tracks, lanes: Lanes, candidates: _Candidates, chosen: NDArra
 
 def write_table(matched: Matched, file: Path) -> None:
     """Write the table as .parquet or .csv; numbers in CSV have six digits after the point."""
-    with whole_file(file) as partial:
-        if file.suffix.lower() == ".csv":
-            matched.table.to_csv(partial, index=False, float_format="%.6f")
-        else:
-            matched.table.to_parquet(partial, index=False)
+    write_frame(matched.table, file, "%.6f")

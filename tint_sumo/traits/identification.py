@@ -1,4 +1,4 @@
-"""What traits of recorded drivers are worth, without labels.
+"""Measures of the traits of recorded drivers, without labels.
 
 * Prediction: how likely is what a driver does next, given what is known of it from the beginning of the same encounter,
   or from its other encounters? In the middle of each window of 2 s the distance driven in the next second is predicted,

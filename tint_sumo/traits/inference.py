@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import MIN_WINDOW_STEPS, STEP_S, WINDOW_STEPS, VehicleShape
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.files import require_output_file, whole_file
+from tint_sumo.core.files import require_output_file, write_frame
 from tint_sumo.core.percentages import percent
 from tint_sumo.dataset.tracks import read_tracks
 from tint_sumo.dataset.windows import Windows, cut_windows, window_rows
@@ -154,11 +154,7 @@ def write_table(table: pd.DataFrame, out: Path) -> None:
         InputError: ``out`` cannot be such a file, or lies in the folder of a run.
     """
     require_output_file(out, SUFFIXES)
-    with whole_file(out) as partial:
-        if out.suffix.lower() == ".csv":
-            table.to_csv(partial, index=False)
-        else:
-            table.to_parquet(partial, index=False)
+    write_frame(table, out)
 
 
 def _columns(prefix: str, latents: Latents) -> dict[str, NDArray[np.float32]]:

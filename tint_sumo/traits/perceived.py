@@ -40,6 +40,14 @@ class Perceived:
         number: NDArray[np.int64] = np.arange(count) + count * (np.cumsum(self.begins, axis=0) - 1)
         return number
 
+    @property
+    def begins_track(self) -> NDArray[np.bool_]:
+        """(T, N, V) whether a vehicle is seen that was not seen in that slot at the step before, in this episode."""
+        found = self.present.copy()
+        same = (self.track[1:] == self.track[:-1]) & ~self.begins[1:, :, None]
+        found[1:] &= ~(self.present[:-1] & same)
+        return found
+
 
 def wait(begins: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Let all egos wait; a ``Drive``."""

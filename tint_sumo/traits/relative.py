@@ -212,6 +212,15 @@ def densities(total: Floats, count: float, latent: Floats, differences: int) -> 
 
 
 @compiled
+def _of_groups(density: Floats, first: float, middle: int, d: int) -> tuple[float, float]:
+    """Return the density of a driver's x as one of the first group, whose share is ``first``, and as one of the other.
+
+    ``middle`` is the place of T on the grid; the groups' means are d places to either side.
+    """
+    return first * density[middle + d], (1.0 - first) * density[middle - d]
+
+
+@compiled
 def learn(town: Floats, density: Floats) -> float:
     """Change the belief about a town (3, 7, 29) by one driver's densities; return the density of its x."""
     shares, differences, towns = town.shape
@@ -220,8 +229,8 @@ def learn(town: Floats, density: Floats) -> float:
         first = SHARES[share]
         for d in range(differences):
             for t in range(towns):
-                middle = t + differences - 1
-                town[share, d, t] *= first * density[middle + d] + (1.0 - first) * density[middle - d]
+                one, other = _of_groups(density, first, t + differences - 1, d)
+                town[share, d, t] *= one + other
                 whole += town[share, d, t]
     town /= whole
     return whole
@@ -236,8 +245,7 @@ def probability(town: Floats, density: Floats) -> float:
         first = SHARES[share]
         for d in range(differences):
             for t in range(towns):
-                middle = t + differences - 1
-                one, other = first * density[middle + d], (1.0 - first) * density[middle - d]
+                one, other = _of_groups(density, first, t + differences - 1, d)
                 found += town[share, d, t] * one / (one + other)
     return found
 

@@ -101,13 +101,10 @@ class _Tracks:
     @classmethod
     def of(cls, seen: Perceived, settings: RelativeSettings) -> Self:
         _, total, count = follow(settings, seen)
-        goes_on = np.zeros_like(seen.present)
-        same = (seen.track[:-1] == seen.track[1:]) & ~seen.begins[1:, :, None]
-        goes_on[:-1] = seen.present[:-1] & seen.present[1:] & same
-        begins = seen.present.copy()
-        begins[1:] &= ~goes_on[:-1]
+        begins, ends = seen.begins_track, seen.present.copy()
+        ends[:-1] &= ~seen.present[1:] | begins[1:]
         env, slot, first = np.nonzero(np.moveaxis(begins, 0, -1))  # both in the order of environment, slot and time
-        last = np.nonzero(np.moveaxis(seen.present & ~goes_on, 0, -1))[2]
+        last = np.nonzero(np.moveaxis(ends, 0, -1))[2]
         middle = (first + last) // 2
         before = np.maximum(middle - _PAUSE_STEPS // 2, first)
         after = np.minimum(middle + _PAUSE_STEPS // 2, last)

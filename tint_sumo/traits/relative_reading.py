@@ -1,4 +1,4 @@
-"""How well relative traits tell who yields: accuracy, calibration, and the same for any numbers about drivers."""
+"""Accuracy and calibration of probabilities of yielding, from relative traits or any other numbers about drivers."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -19,7 +19,7 @@ Floats = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Readings:
-    """What is known of M drivers at some steps of the traffic, and whether they yield."""
+    """Numbers about M drivers at some steps of the traffic, and whether they yield."""
 
     values: Floats  # (M, F)
     yields: NDArray[np.bool_]  # (M,)
@@ -29,10 +29,7 @@ class Readings:
     def of(cls, seen: Perceived, values: Floats) -> Self:
         """Return the readings of every tenth step of traffic; ``values`` are (T, N, V, F)."""
         steps = np.arange(len(seen.present))
-        begins = seen.present.copy()
-        same = (seen.track[:-1] == seen.track[1:]) & ~seen.begins[1:, :, None]
-        begins[1:] &= ~(seen.present[:-1] & same)
-        first = np.maximum.accumulate(np.where(begins, steps[:, None, None], 0), axis=0)
+        first = np.maximum.accumulate(np.where(seen.begins_track, steps[:, None, None], 0), axis=0)
         chosen = seen.present & (steps % EVERY_STEPS == EVERY_STEPS - 1)[:, None, None]
         age = (steps[:, None, None] - first)[chosen]
         return cls(values[chosen], seen.traits[chosen] == 0, age)
@@ -40,7 +37,7 @@ class Readings:
 
 @dataclass(frozen=True)
 class Reading:
-    """How well probabilities of yielding fit the truth."""
+    """Probabilities of yielding beside the truth, and their scores."""
 
     probability: Floats  # (M,) of yielding
     yields: NDArray[np.bool_]  # (M,)

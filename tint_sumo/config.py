@@ -44,6 +44,7 @@ Perceivable = Literal["traffic_light", "right_of_way", "speed_limit", "lane", "p
 Fraction = Annotated[float, Range(0.0, 1.0)]
 SEEDS = Range(0, 1000)
 Seed = Annotated[int, SEEDS]  # of a training
+EpisodesSeed = Annotated[int, Range(0, 999)]  # of recorded episodes of a policy; a million each, below all test cases
 TrafficSeed = Annotated[int, Range(0, 2**32 - 1)]
 SpeedMps = Annotated[float, Range(0.0, 60.0)]
 DistanceM = Annotated[float, Range(0.0, 1000.0)]

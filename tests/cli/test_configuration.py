@@ -53,6 +53,7 @@ COMMAND_LINES = (
     "policy evaluate --model no",
     "policy evaluate --model ttc --sensor range_15",
     "policy train --method oracle --out run --sensor occlusion",
+    "policy record --model ttc --minari ttc-v0 --out minari --episodes 7 --random-actions 0.1 --author Ada --workers 2",
     "policy sweep --set learning_rate=1e-3,3e-3 n_epochs=2,4 --out s3://bucket/sweep --methods oracle ma --seeds 0 1",
     "study run --budget full --scene on_ramp --workers 3",
     "study report --out runs/full",

@@ -27,6 +27,7 @@ WRITING = {
     "traits infer": "traits infer --fcd DATA --model vae --out OUT",
     "traits study": "traits study --out OUT",
     "policy train": "policy train --method oracle --out OUT",
+    "policy record": "policy record --model ttc --episodes 1 --minari ttc-v0 --out OUT",
     "policy sweep": "policy sweep --set n_epochs=1 --out OUT",
     "render": "render --model ttc --out OUT",
     "study run": "study run --out OUT",
@@ -75,6 +76,7 @@ def test_a_run_is_not_written_into_by_others(name: str, run: Path, capsys: pytes
         "drivers export",
         "traits plot",
         "traits infer",
+        "policy record",
         "render",
     ):  # others have homes of their own
         outs += [run / "new.png", run / "new.csv", run / "new.gif", run / "new"]

@@ -1,8 +1,10 @@
 """``tint-sumo policy``."""
 
 import signal
+import sys
 from pathlib import Path
 
+import minari
 import pytest
 
 from tests.cli.calls import Started, copy, files, refuse, run
@@ -130,3 +132,43 @@ def test_an_interrupted_training_goes_on(
     run(capsys, *argv)
     assert (tmp_path / "run" / "policy.safetensors").exists()
     assert not (tmp_path / "run" / CHECKPOINT_FILE).exists()
+
+
+def test_episodes_are_recorded_for_minari(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    argv = ("policy", "record", "--model", "ttc", "--episodes", 2, "--world", "towns", "--seed", 4)
+    found = run(capsys, *argv, "--minari", "ttc-v0", "--author", "Ada")
+    assert found["folder"] == str(tmp_path / "minari" / "ttc-v0")
+    dataset = minari.load_dataset("ttc-v0")
+    assert (found["episodes"], found["decisions"]) == (len(dataset), dataset.total_steps)
+    assert sum(found["outcomes"].values()) == 2
+    assert dataset.storage.metadata["author"] == {"Ada"} and "towns" in dataset.env_spec.kwargs["scene"]["population"]
+    before = files(tmp_path)
+    assert "is there already; give another name or version as --minari" in refuse(capsys, *argv, "--minari", "ttc-v0")
+    assert "--minari one as tint_sumo/streaming-v0" in refuse(capsys, *argv, "--minari", "ttc")
+    monkeypatch.setitem(sys.modules, "minari", None)
+    monkeypatch.delitem(sys.modules, "tint_sumo.methods.minari_dataset")
+    assert 'install it: pip install "tint_sumo[minari]"' in refuse(capsys, *argv, "--minari", "ttc-v1")
+    assert files(tmp_path) == before
+
+
+@pytest.mark.slow
+def test_recorded_episodes_do_not_depend_on_the_number_of_processes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ("policy", "record", "--model", "oracle", "--episodes", 52, "--p-conservative", 0.9, "--minari", "oracle-v0")
+    for workers in (1, 2):
+        run(capsys, *argv, "--workers", workers, "--out", tmp_path / str(workers))
+    one, two = ({path.name: content for path, content in files(tmp_path / str(count)).items()} for count in (1, 2))
+    assert one == two and len(one) == 2
+
+
+@pytest.mark.long
+def test_an_interrupted_recording_of_episodes_leaves_nothing(tmp_path: Path) -> None:
+    argv = ("policy", "record", "--model", "always_go", "--episodes", 5000, "--minari", "mine/b-v0", "--out", tmp_path)
+    printed = Started(*argv).interrupt_at(r"[1-9]\d*% ", signal.SIGTERM)
+    assert "Traceback" not in printed
+    assert "interrupted; all files are whole, nothing was kept" in printed
+    assert list(tmp_path.iterdir()) == []

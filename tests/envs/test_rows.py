@@ -22,6 +22,7 @@ from tint_sumo.envs.rows import (
     copied,
     end_info,
     fields_of,
+    full_info,
     judge,
     observation_of,
     observe,
@@ -281,3 +282,20 @@ def test_the_way_in_a_sumo_configuration_is_worth_as_much_whatever_its_length_an
         assert rules.speed_weight_per_mps / step_s * (scene.goal_m - scene.start_m) == pytest.approx(whole, rel=1e-3)
         assert rules.step / step_s == pytest.approx(-0.0013 / 0.1)
         assert (rules.goal, rules.collision) == (2.5, -2.0)
+
+
+@pytest.mark.parametrize("contents", [Contents(), Contents(step_infos=("cost",), terms=("goal", "red_light"))])
+def test_a_full_info_has_the_same_keys_in_every_step(contents: Contents) -> None:
+    rows = np.zeros((), row_type(3, [("cost", np.float64, ()), ("red_light", np.float64, ())]))
+    rows["town"] = NO_TOWN
+    fields = fields_of(rows)
+    begun, going_on = start_info(fields, contents), step_info(fields, contents, {})
+    hit = {"trait": "aggressive", "route": "lower", "slot": 2, "ego_m": (1.0, 2.0)}
+    ended = step_info({**fields, "outcome": 3}, contents, hit)
+    full = [full_info(info, contents) for info in (begun, going_on, ended)]
+    assert {tuple(sorted(info)) for info in full} == {tuple(sorted(full[0]))}
+    assert {tuple(info["reward_terms"]) for info in full} == {contents.terms}
+    assert {tuple(info["collision"]) for info in full} == {tuple(hit)}
+    assert full[2]["collision"] == hit and full[0]["collision"]["trait"] == ""
+    assert [info["is_success"] for info in full] == [False, False, False]
+    assert [name for name in ("cost",) if name in full[0]] == list(contents.step_infos)

@@ -27,7 +27,7 @@ from tint_sumo.cli.values import (
     WorldName,
     optional,
 )
-from tint_sumo.config import SENSORS, Decisions, Mix, NoiseM, Seed, Sensor, network_ppo
+from tint_sumo.config import SENSORS, Decisions, EpisodesSeed, Fraction, Mix, NoiseM, Seed, Sensor, network_ppo
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.ranges import Processes
@@ -47,6 +47,8 @@ _TRAITS = optional(
     ".safetensors file.",
     "the method's shipped one",
 )
+_MINARI = arg(metavar="NAME", help="Name of the dataset, such as tint_sumo/streaming-v0; needs tint_sumo[minari].")
+_ROOT = optional("FOLDER", "Folder of all datasets.", "Minari's: MINARI_DATASETS_PATH, or ~/.minari/datasets")
 _SENSOR = arg(help=f"Sensor that the ego perceives the others with: {', '.join(SENSORS)}.")
 _SET = arg(
     metavar="NAME=VALUE,VALUE [NAME=VALUE,VALUE ...]",
@@ -189,6 +191,63 @@ class EvaluatePolicy(NetworkCommand, SpreadCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RecordPolicy(NetworkCommand):
+    """Record episodes of a policy as a Minari dataset for offline learning; none of them is a test case."""
+
+    model: PolicyName
+    minari: Annotated[str, _MINARI]
+    out: Annotated[Path | None, _ROOT] = None
+    p_conservative: TestMix = None
+    world: WorldName = None
+    scene: TestScene = None
+    sensor: TestSensor = None
+    noise: NoiseM = 0.0
+    """Standard deviation of the noise on the others' positions, m, with a sensor that has none."""
+    tau: TestTau = None
+    episodes: Cases = 500
+    """Number of episodes."""
+    random_actions: Fraction = 0.0
+    """Share of the decisions whose action is drawn at random, for data that cover more than the policy does, 0 to 1."""
+    seed: EpisodesSeed = 0
+    """Number of the set of episodes, 0 to 999; no two sets share any."""
+    workers: Processes = 1
+    """Processes of this machine; the dataset does not depend on their number."""
+    author: Annotated[str | None, optional("NAME", "Author of the dataset.")] = None
+    author_email: Annotated[str | None, optional("ADDRESS", "The author's address.")] = None
+    code_permalink: Annotated[str | None, optional("URL", "Code with which the dataset was made.")] = None
+    description: Annotated[str | None, optional("TEXT", "Description.", "policy, scene and outcomes")] = None
+    allow_pickle: bool = False
+    """Read .zip files, which can run any code: for files that you trust alone."""
+
+    def run(self) -> Outcome:
+        from tint_sumo.jobs.table import one_job
+        from tint_sumo.methods.loading import load_policy
+
+        try:
+            from tint_sumo.methods.minari_dataset import Credits, PolicyEpisodes, record_minari
+        except ModuleNotFoundError as error:
+            if error.name not in ("minari", "h5py"):
+                raise
+            raise InputError('--minari needs Minari; install it: pip install "tint_sumo[minari]"') from None
+        use_one_thread()
+        contender = load_policy(self.model, scene=self.scene_of(self.scene), allow_pickle=self.allow_pickle)
+        task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau, self.world)
+        episodes = PolicyEpisodes(
+            self.model, task, self.episodes, self.seed, self.random_actions, allow_pickle=self.allow_pickle
+        )
+        credits = Credits(self.author, self.author_email, self.code_permalink, self.description)
+        with one_job(f"record {self.model}") as report:
+            found = record_minari(
+                self.minari, episodes, root=self.out, credits=credits, workers=self.workers, report=report
+            )
+        lines = [f"{outcome:9} {count}" for outcome, count in found.outcomes.items()]
+        text = "\n".join([*lines, f"{found.steps} decisions", *wrote([str(found.folder)])])
+        content = {"model": self.model, **content_of(task), "seed": self.seed, "random_actions": self.random_actions}
+        shown = {"episodes": self.episodes, "decisions": found.steps, "outcomes": found.outcomes}
+        return Outcome(text, {**content, **shown, "minari": self.minari, "folder": str(found.folder)})
+
+
+@dataclass(frozen=True, kw_only=True)
 class SweepPolicy(SpreadCommand):
     """Train and test methods with all combinations of some settings of PPO; the same command resumes it."""
 
@@ -238,6 +297,7 @@ class Policy:
     command: (
         Annotated[TrainPolicy, subcommand("train")]
         | Annotated[EvaluatePolicy, subcommand("evaluate")]
+        | Annotated[RecordPolicy, subcommand("record")]
         | Annotated[SweepPolicy, subcommand("sweep")]
     )
 

@@ -6,19 +6,24 @@ the entry point. So these are classes, and here alone keyword arguments become s
 """
 
 from collections.abc import Collection, Iterable, Mapping
+from copy import deepcopy
 from dataclasses import fields
 from inspect import signature
 from typing import Any
 
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
-from tint_sumo.config import NOISES, Sensor
+from tint_sumo import ENV_IDS, SCENE_ENV_ID
+from tint_sumo.config import NOISES, SENSORS, Sensor
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.structures import require_fields
+from tint_sumo.core.structures import plain, require_fields
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.scene_env import SceneEnv
 from tint_sumo.envs.vector import SceneVectorEnv
 from tint_sumo.envs.worlds import find_world, task_in, tasks_in
+from tint_sumo.scenes import SCENES, scene_settings
 
 _NOISE = "position_noise_m"  # shorthand for a sensor that has this noise alone
 _OF_THE_WORLD = ("sensor", "tau_s")
@@ -86,6 +91,24 @@ class StrangersVectorEnv(SceneVectorEnv):
     ) -> None:
         tasks = tasks_in(find_world(world), _stranger_task(StrangersVectorEnv, task))
         super().__init__(num_envs, tasks, render_mode, workers, autoreset_mode)
+
+
+def env_spec(task: TaskSettings) -> EnvSpec:
+    """Return gymnasium's specification of the environment with these settings, which can be written as JSON.
+
+    Raises:
+        InputError: the scene cannot be described: its roads are those of no built-in scene.
+    """
+    default = TaskSettings()
+    arguments = {field.name: getattr(task, field.name) for field in fields(task)}
+    given = {name: plain(value) for name, value in arguments.items() if value != getattr(default, name)}
+    if "sensor" in given:
+        given["sensor"] = next((name for name, known in SENSORS.items() if known == task.sensor), given["sensor"])
+    scene = next((name for name, make in SCENES.items() if make() == task.scene), None)
+    given["scene"] = scene or plain(scene_settings(task.scene))
+    spec = deepcopy(gymnasium.spec(ENV_IDS.get(scene or "", SCENE_ENV_ID)))
+    spec.kwargs = given
+    return spec
 
 
 def _stranger_task(entry_point: type, task: Mapping[str, Any]) -> TaskSettings:

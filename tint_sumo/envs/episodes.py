@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -26,6 +26,7 @@ from tint_sumo.config import (
 )
 from tint_sumo.core.errors import InputError, find_named, shown
 from tint_sumo.core.ranges import require_ranges
+from tint_sumo.core.structures import choose
 from tint_sumo.envs.pedestrians import PedestrianSensing
 from tint_sumo.envs.perceived import (
     Road,
@@ -59,7 +60,7 @@ from tint_sumo.envs.rows import (
     row_type,
 )
 from tint_sumo.envs.sensing import Sensing
-from tint_sumo.scenes import AnyScene, Scene, SumocfgScene, find_scene, paper_scene, require_built_in
+from tint_sumo.scenes import AnyScene, Scene, SumocfgScene, find_scene, paper_scene, read_scene, require_built_in
 from tint_sumo.scenes.buildings import corner_buildings
 from tint_sumo.scenes.geometry import NO_VEHICLE, Floats
 from tint_sumo.scenes.replay import ReplayScene
@@ -75,8 +76,9 @@ _STEP_TOLERANCE = 1e-6  # of decision_s in steps, for numbers such as 0.3 / 0.1
 class TaskSettings:
     """Settings of an episode; ``tint_sumo.envs.scene_env.SceneEnv`` explains them.
 
-    They are made once, by the user or by a command, and passed on as they are. Names of a built-in scene and of a
-    sensor, and one number or two for ``p_conservative``, are taken here, too, and nowhere below.
+    They are made once, by the user or by a command, and passed on as they are. A scene and a sensor may also be given
+    by a name or as a mapping, as in configuration files, and ``p_conservative`` as one number or two: here, and
+    nowhere below.
 
     Raises:
         InputError: a value makes no sense.
@@ -94,7 +96,10 @@ class TaskSettings:
     backend: Backend = "auto"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "scene", find_scene(self.scene))
+        given: Any = self.scene
+        object.__setattr__(
+            self, "scene", read_scene(given, ("scene",)) if isinstance(given, Mapping) else find_scene(given)
+        )
         if self.p_conservative is not None:
             object.__setattr__(self, "p_conservative", Mix.parse(self.p_conservative))
         object.__setattr__(self, "sensor", find_sensor(self.sensor))
@@ -203,14 +208,17 @@ class TaskSettings:
         return replace(scene, time_limit_s=limit_s)
 
 
-def find_sensor(sensor: str | Sensor) -> Sensor:
-    """Return the sensor of this name, or the sensor itself.
+def find_sensor(sensor: str | Mapping[str, Any] | Sensor) -> Sensor:
+    """Return the sensor of this name, the one that a mapping describes as in a configuration file, or itself.
 
     Raises:
-        InputError: there is none of this name, or it is no sensor.
+        InputError: there is none of this name, it is no sensor, or a value does not fit.
     """
     if isinstance(sensor, Sensor):
         return sensor
+    if isinstance(sensor, Mapping):
+        sensor = choose(sensor, SENSORS, "perfect", ("sensor",))
+        return sensor if isinstance(sensor, Sensor) else SENSORS[sensor]
     if not isinstance(sensor, str):
         raise InputError(f"sensor must be a Sensor or a name ({', '.join(SENSORS)}), not {shown(sensor)}")
     return find_named("sensor", sensor, SENSORS)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tint_sumo.config import OBSERVATION_BOUND, STEP_S, RewardPreset
 from tint_sumo.core.compiling import compiled
 from tint_sumo.scenes.drivers import NO_TOWN
-from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers
+from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.scene import Scene
 from tint_sumo.scenes.sumocfg import SumocfgScene
 
@@ -136,6 +136,17 @@ def end_info(outcome: str, collision: dict[str, Any]) -> dict[str, Any]:
     """Return what a step's info holds only where an episode has ended; ``collision`` is empty without one."""
     ending = {"is_success": outcome == "success"}
     return {**ending, "collision": collision} if collision else ending
+
+
+def full_info(info: Mapping[str, Any], contents: Contents) -> dict[str, Any]:
+    """Return an info with the same keys in every step of an episode, as arrays of all steps need them.
+
+    After a reset rewards and costs are 0, before the end ``is_success`` is False, and without a collision its texts are
+    empty, its slot is -1 and its position nan.
+    """
+    start = {"reward_terms": dict.fromkeys(contents.terms, 0.0), **dict.fromkeys(contents.step_infos, 0.0)}
+    no_collision = {"trait": "", "route": "", "slot": NO_VEHICLE, "ego_m": (math.nan, math.nan)}
+    return {**start, "is_success": False, "collision": no_collision, **info}
 
 
 class TaskRules(NamedTuple):

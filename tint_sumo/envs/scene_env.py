@@ -128,9 +128,10 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     `gymnasium.make` takes all of these as keyword arguments. The class itself takes `render_mode`, and all others as a
     `tint_sumo.envs.TaskSettings`: `SceneEnv(TaskSettings("on_ramp", p_conservative=0.4), render_mode="human")`.
 
-    * `scene`: name of a scene, a `tint_sumo.scenes.Scene`, or what `tint_sumo.scenes.from_sumocfg` makes of a SUMO
-      configuration of your own. Then the traffic is the configuration's, several lanes and changes between them
-      included; `ego` is seen from where it starts, with the network's axes, its position divided by half of the way
+    * `scene`: name of a scene, a mapping as in configuration files (`{"base": "four_way", "max_vehicles": 8}`), a
+      `tint_sumo.scenes.Scene`, or what `tint_sumo.scenes.from_sumocfg` makes of a SUMO configuration of your own. Then
+      the traffic is the configuration's, several lanes and changes between them included;
+      `ego` is seen from where it starts, with the network's axes, its position divided by half of the way
       from its start to its goal, and its velocities by its top speed, if these are above 20 m and 3 m/s; `vehicles` are
       the nearest in sight, divided by half of `sight_m` if that is above 20 m;
       `traits` are the numbers of their vTypes in `scene.vtypes`; `position_m` is what their odometers show, and
@@ -143,9 +144,10 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * `time_limit_s`: default 50 s.
     * `max_episode_steps`: gymnasium's way to say it, in steps of the environment. `gymnasium.make` does not pass it on:
       it wraps the environment in a `TimeLimit`, with which `outcome` stays empty; `gymnasium.make_vec` passes it on.
-    * `sensor`: how the ego perceives the other vehicles: a `tint_sumo.config.Sensor`, or the name of one in
-      `tint_sumo.config.SENSORS`; default perfect. It may have noise, dropouts, a range, a field of view, occlusion and
-      a delay. `vehicles`, `mask`, and all infos of `tracks` are what it perceives: a vehicle that is not seen has no
+    * `sensor`: how the ego perceives the other vehicles: a `tint_sumo.config.Sensor`, a mapping as in
+      configuration files, or the name of one in `tint_sumo.config.SENSORS`; default perfect. It may have noise,
+      dropouts, a range, a field of view, occlusion and a delay.
+      `vehicles`, `mask`, and all infos of `tracks` are what it perceives: a vehicle that is not seen has no
       slot, is nobody's leader, and comes back as a new track. The ego's controller and its safety check, and the
       drivers, do not look through it.
     * `position_noise_m`: shorthand of `gymnasium.make` for a sensor that has only this noise: standard deviation of

@@ -1,7 +1,8 @@
 """Evaluation of policies on unseen cases, which are the same for every method."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
+from contextlib import closing
 from dataclasses import astuple, dataclass
 from typing import Annotated, Any
 
@@ -14,6 +15,7 @@ from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.statistics import Rate
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES, COST, OUTCOMES, Outcome
+from tint_sumo.methods.driving import DrivenEpisode, drive
 from tint_sumo.methods.registry import Policy
 
 # Seed of the first case. Training draws its environments' seeds below this number, so no case is ever trained on.
@@ -23,7 +25,6 @@ CASE_SETS = Range(0, 1000)
 REPORTED_SET = 0  # case set of studies
 TUNING_SET = 1000  # case set on which settings are chosen; reported nowhere
 BATCH = 100  # environments at a time
-_STOP = 0  # action of environments whose case is over
 
 
 @dataclass(frozen=True)
@@ -137,34 +138,11 @@ def evaluate(
     """
     require_cases(episodes, case_set, first)
     cases: dict[int, Case] = {}
-    venv = make_venv(min(batch, episodes))
-    try:
-        for done in range(0, episodes, venv.num_envs):
-            wanted = min(venv.num_envs, episodes - done)
-            for index, case in _first_episodes(policy, venv, case_seed(case_set, first + done), wanted):
-                cases[done + index] = case
-                report(Progress(len(cases), episodes, "case", _shares(cases.values())))
-    finally:
-        venv.close()
+    with closing(drive(policy, make_venv, case_seed(case_set, first), episodes, batch)) as all_driven:
+        for driven in all_driven:
+            cases[driven.number] = _case(driven)
+            report(Progress(len(cases), episodes, "case", _shares(cases.values())))
     return Evaluation(tuple(cases[number] for number in range(episodes)))
-
-
-def _first_episodes(policy: Policy, venv: VecEnv, first_seed: int, wanted: int) -> Iterator[tuple[int, Case]]:
-    """Yield index and first episode of each of the first ``wanted`` environments, as they end."""
-    venv.seed(first_seed)
-    observation: Any = venv.reset()
-    state, starts, costs = None, np.ones(venv.num_envs, bool), np.zeros(venv.num_envs)
-    running = np.arange(venv.num_envs) < wanted
-    while running.any():
-        actions, state = policy.predict(observation, state=state, episode_start=starts, deterministic=True)
-        observation, _, starts, infos = venv.step(np.where(running, actions, _STOP))
-        costs += [info.get(COST, 0.0) for info in infos]
-        ended = np.flatnonzero(starts & running).tolist()
-        for index in ended:
-            yield index, _case(infos[index], float(costs[index]))
-        if ended:
-            running &= ~starts
-            venv.env_method("park", indices=ended)
 
 
 def _shares(cases: Collection[Case]) -> dict[str, float]:
@@ -173,8 +151,9 @@ def _shares(cases: Collection[Case]) -> dict[str, float]:
     return {outcome: ends[outcome] / len(cases) for outcome in ("success", "collision")}
 
 
-def _case(info: dict[str, Any], cost: float) -> Case:
-    """Return the case that an episode's last info ends, with the sum of its costs."""
+def _case(driven: DrivenEpisode) -> Case:
+    """Return the case that a driven episode is."""
+    info = driven.info
     hit = info.get("collision", {})
     return Case(
         info["outcome"],
@@ -182,5 +161,5 @@ def _case(info: dict[str, Any], cost: float) -> Case:
         hit.get("trait"),
         hit.get("route"),
         info.get("town"),
-        cost if COST in info else None,
+        driven.cost if COST in info else None,
     )

@@ -1,4 +1,4 @@
-# make install | study | test | test-long | lint | coverage | mutants | docs | net | dist | clean
+# make install | study | test | test-long | lint | coverage | mutants | docs | docs-version | net | dist | clean
 # Another build of torch: make install TORCH=torch
 # Another Python, with an environment of its own beside .venv: make test PYTHON=python3.12
 PYTHON ?= python3
@@ -7,7 +7,7 @@ TORCH ?=
 BIN := $(VENV)/bin
 DIST := dist
 
-.PHONY: install study test test-long lint coverage mutants docs net dist clean
+.PHONY: install study test test-long lint coverage mutants docs docs-version net dist clean
 
 install: $(VENV)/.installed
 
@@ -47,6 +47,10 @@ mutants: install
 docs: install
 	PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "open build/docs/index.html"
+
+# A version of the site beside the others, on the branch gh-pages: make docs-version NAMES="0.1 latest"
+docs-version: install
+	PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 OFFLINE=false $(BIN)/mike deploy --update-aliases $(NAMES)
 
 net: install
 	$(BIN)/tint-sumo net --out sumo_net

@@ -1,6 +1,7 @@
 """The package as users install it."""
 
 import ast
+import json
 import os
 import re
 import subprocess
@@ -11,9 +12,11 @@ import tomllib
 import venv
 import zipfile
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.utils import canonicalize_name
 
 import tint_sumo
@@ -167,11 +170,34 @@ def test_commands_write_what_is_asked_and_nothing_beside_it(
 
 
 def test_the_version_is_the_same_everywhere() -> None:
-    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    """It is written once for Python; other files repeat it."""
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     version = tint_sumo.__version__
-    assert f"\nversion: {version}\n" in citation
-    assert f"\n## [{version}] - 2" in changes or f"\nThis will be version {version}" in changes
+    released = re.search(rf"^## \[{re.escape(version)}\] - (\d{{4}}-\d\d-\d\d)$", changes, re.MULTILINE)
+    assert released or f"\nThis will be version {version}," in changes
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == version
+    assert citation.get("date-released") == (date.fromisoformat(released[1]) if released else None)
+    images = [
+        image
+        for folder in ("examples", "docs")
+        for file in (ROOT / folder).rglob("*")
+        if file.suffix in {".md", ".yaml", ""} and file.is_file()
+        for image in re.findall(r"tint-sumo:(\d[\w.]+\w)", file.read_text(encoding="utf-8"))
+    ]
+    assert set(images) == {version}
+
+
+def test_package_citation_and_archive_describe_the_same_work() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    archive = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
+    assert project["keywords"] == citation["keywords"] == archive["keywords"]
+    assert project["license"] == citation["license"] == archive["license"]
+    assert citation["title"] == archive["title"] and project["name"] in citation["title"]
+    assert [one["name"] for one in citation["authors"]] == [one["name"] for one in archive["creators"]]
+    papers = [one["identifier"] for one in archive["related_identifiers"]]
+    assert papers == [one["value"] for one in citation["preferred-citation"]["identifiers"]]
 
 
 def test_pre_commit_runs_the_linters_of_the_makefile() -> None:

@@ -770,7 +770,7 @@ _FULL_PPO = PpoSettings(
 PPO_BUDGETS = {
     "quick": replace(_FULL_PPO, n_envs=64, total_steps=200_000),
     "full": _FULL_PPO,
-    "strangers": replace(_FULL_PPO, reward="careful", motion=True, total_steps=3_200_000),
+    "strangers": replace(_FULL_PPO, reward="careful", motion=True, n_epochs=8),
     "paper": PpoSettings(),
 }
 

@@ -1,17 +1,24 @@
 import json
+from dataclasses import replace
 
 import pytest
 
 from tint_sumo import traits
 from tint_sumo.config import (
     ALL_MIXES,
+    HELD_OUT_WORLDS,
     P_CONSERVATIVE,
+    PERFECT,
+    POPULATIONS,
+    SENSORS,
+    TRAINING_SENSORS,
     TRAIT_BUDGETS,
     Idm,
     Mix,
     PpoSettings,
     TraitSettings,
 )
+from tint_sumo.core.errors import InputError
 from tint_sumo.core.structures import plain
 from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.registry import Learned, find_method
@@ -70,7 +77,7 @@ def test_the_full_budget_compares_all_methods_with_four_seeds_in_other_condition
 
 
 def test_trait_budgets_are_networks_of_one_kind() -> None:
-    assert set(TRAIT_BUDGETS) == set(BUDGETS)
+    assert set(TRAIT_BUDGETS) <= set(BUDGETS)
     assert TRAIT_BUDGETS["quick"].hidden_size == TRAIT_BUDGETS["full"].hidden_size
 
 
@@ -83,6 +90,7 @@ def test_trait_budgets_are_networks_of_one_kind() -> None:
         (Conditions(Mix(0.4), tau_s=1.5), "tau 1.5 s"),
         (Conditions(Mix(0.4), tau_s=Idm.tau_s), "tau 1 s"),
         (Conditions(Mix(0.4), percent=25), "25 % of training"),
+        (Conditions(ALL_MIXES, percent=50, world="range_15"), "range 15 m, 50 % of training"),
         (Conditions(Mix(0.4), 0.1, 0.7, 50), "noise 0.1 m, tau 0.7 s, 50 % of training"),
     ],
 )
@@ -104,3 +112,32 @@ def test_conditions_are_the_same_with_whole_numbers_as_with_floats() -> None:
     whole, floats = Conditions(Mix(0, 1), 2, 3), Conditions(Mix(0.0, 1.0), 2.0, 3.0)
     assert whole == floats and repr(whole) == repr(floats)
     assert Conditions(Mix(1)).is_single_mix and not Conditions(Mix(0, 1)).is_single_mix
+
+
+def test_strangers_are_driven_among_in_worlds_that_no_training_has_met() -> None:
+    budget = BUDGETS["strangers"]
+    scene = find_scene("t_intersection")
+    assert budget.trained_in(scene).population == POPULATIONS["towns"]
+    assert budget.sensors == TRAINING_SENSORS and budget.ppo.motion
+    worlds = [one.world for trials in budget.trials for one in trials.conditions]
+    assert set(worlds) == {"old", "towns", *HELD_OUT_WORLDS}
+    assert BUDGETS["full"].trained_in(scene) == scene and BUDGETS["full"].sensors == (PERFECT,)
+
+
+def test_a_world_is_the_drivers_and_the_sensor_of_a_test() -> None:
+    scene = find_scene("t_intersection")
+    slow, near = (Conditions(ALL_MIXES, world=name).task(scene) for name in ("headway_1.5", "range_15"))
+    assert (slow.played.tau_s, slow.sensor) == (1.5, PERFECT)
+    assert (near.played.tau_s, near.sensor) == (Idm.tau_s, SENSORS["range_15"])
+    elsewhere = Conditions(Mix(0.4), world="old")
+    assert elsewhere.resolved(1.5) == elsewhere and not elsewhere.is_single_mix
+    for unfit, words in (
+        ({"world": "mars"}, "mars"),
+        ({"world": "strangers"}, "are for training"),
+        ({"world": "old", "tau_s": 1.5}, "leave position_noise_m and tau_s out"),
+        ({"world": "old", "position_noise_m": 0.1}, "leave position_noise_m and tau_s out"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Conditions(ALL_MIXES, **unfit)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="mars"):
+        replace(BUDGETS["full"], world="mars")

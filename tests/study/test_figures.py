@@ -15,8 +15,8 @@ from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import METHODS
 from tint_sumo.study import figures
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves
-from tint_sumo.study.summary import at_mixes, over_all_mixes, tabulate
+from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_worlds
+from tint_sumo.study.summary import at_mixes, in_worlds, over_all_mixes, tabulate
 
 AS_TRAINED = Conditions(ALL_MIXES)
 OTHERS = (
@@ -140,3 +140,16 @@ def test_methods_of_the_past_are_drawn_under_their_names(tmp_path: Path, drawn: 
     assert [container.get_label() for container in drawn().axes[0].containers] == ["forgotten"]
     plot_bars(at_mixes(rows), tmp_path / "bars.png")
     assert drawn().axes[0].get_yticklabels()[0].get_text() == "forgotten"
+
+
+def test_worlds_have_a_line_each_and_methods_a_marker(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    worlds = [Conditions(ALL_MIXES, world=name) for name in ("range_15", "old", "eidm")]
+    rows = tabulate(
+        [trained("oracle", 0, dict.fromkeys(worlds, (8, 1, 1))), given("ttc", dict.fromkeys(worlds[:2], (5, 1, 4)))]
+    )
+    assert_picture(plot_worlds(in_worlds(rows), tmp_path / "worlds.png"))
+    success, collision = drawn().axes
+    assert [label.get_text() for label in success.get_yticklabels()] == ["the old world", "EIDM", "range 15 m"]
+    for axes, shown in ((success, [[50.0] * 2, [80.0] * 3]), (collision, [[40.0] * 2, [10.0] * 3])):
+        markers = [container[0].get_xdata() for container in axes.containers]  # type: ignore[union-attr]
+        assert [list(x) for x in markers] == shown

@@ -29,7 +29,7 @@ from tint_sumo.scenes.layout import layout
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.page import write_page
-from tint_sumo.study.page.charts import condition_charts, curve_chart, outcome_chart
+from tint_sumo.study.page.charts import condition_charts, curve_chart, outcome_chart, world_chart
 from tint_sumo.study.page.choosing import MOST_CASES, Choice, Shown, choose, choose_cases
 from tint_sumo.study.page.episodes import Recorded, Recordings, failure_lists
 from tint_sumo.study.page.findings import what_came_out
@@ -38,6 +38,7 @@ from tint_sumo.study.page.recording import MISSING, UNITS, Recording, RecordJob,
 from tint_sumo.study.page.roads import scene_shapes
 from tint_sumo.study.report import write_report
 from tint_sumo.study.summary import tabulate
+from tint_sumo.traits.relative import TownEstimate
 
 
 def outcomes(*shorts: str) -> Evaluation:
@@ -108,6 +109,7 @@ def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -
         traits=np.array([0, 1]),
         observed_traits=inferred,
         attention=np.array([0.75, 0.25]),
+        town=TownEstimate(0.25, 0.9),
         claimed=np.array([False, True]),
         desired_mps=3.0,
         value=-1.25,
@@ -121,7 +123,7 @@ def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -
 def test_an_episode_survives_its_small_numbers() -> None:
     moments = (
         moment([7, -1], -3.14, desired_mps=None, value=None),
-        moment([7, 2], 1.5),
+        moment([7, 2], 1.5, seen=np.array([True, False])),
         moment([9, 2], 40.0, "collision", claimed=np.array([True, True]), time_s=0.2),
     )
     driven = Driven(Case("collision", 0.2, "aggressive", "upper"), moments)
@@ -142,6 +144,10 @@ def test_an_episode_survives_its_small_numbers() -> None:
     assert decoded("p_conservative", seventh["p_conservative"]) == pytest.approx([0.88, 0.88])
     assert np.isnan(decoded("p_conservative", second["p_conservative"])).all()  # nothing was inferred
     assert decoded("brakes", second["brakes"]) == [1.0, 1.0]
+    assert decoded("seen", second["seen"]) == [0.0, 1.0]
+    assert "seen" not in seventh, "the ego sees it at all times"
+    assert decoded("town_rank", episode["ego"]["town_rank"]) == pytest.approx([0.25] * 3)
+    assert decoded("town_differs", episode["ego"]["town_differs"]) == pytest.approx([0.9] * 3)
     ego = episode["ego"]
     np.testing.assert_allclose(decoded("value", ego["value"]), [np.nan, -1.25, -1.25])
     np.testing.assert_allclose(decoded("desired_mps", ego["desired_mps"]), [np.nan, 3.0, 3.0])
@@ -149,10 +155,11 @@ def test_an_episode_survives_its_small_numbers() -> None:
 
 
 def test_rules_have_no_value_no_attention_and_nothing_inferred() -> None:
-    bare = replace(moment([1, 2], 0.0, "timeout"), value=None, attention=None, observed_traits=None)
+    nothing = {"value": None, "attention": None, "observed_traits": None, "town": None}
+    bare = moment([1, 2], 0.0, "timeout", **nothing)
     episode = encode(Driven(Case("timeout", 50.0), (bare,)), None, ["lower", "upper"])
     assert episode["hit"] is None
-    assert "value" not in episode["ego"]
+    assert not {"value", "town_rank", "town_differs"} & set(episode["ego"])
     assert not {"attention", "p_conservative"} & set(episode["vehicles"][0])
 
 
@@ -209,6 +216,18 @@ def test_charts_and_their_tables_tell_the_rates_and_intervals() -> None:
     assert trace["x"][0] + trace["error_x"]["array"][0] == pytest.approx(100 * high, abs=0.01)
     assert trace["x"][0] - trace["error_x"]["arrayminus"][0] == pytest.approx(100 * low, abs=0.01)
     assert chart.lines[1:] == [["oracle", "0.4", "85.0", f"{100 * low:.1f} to {100 * high:.1f}"]]
+
+
+def test_worlds_have_a_line_each() -> None:
+    worlds = {Conditions(ALL_MIXES, world="range_15"): (8, 2, 0), Conditions(ALL_MIXES, world="old"): (9, 1, 0)}
+    chart = world_chart(tabulate([trained("oracle", 0, worlds)]), "success")
+    assert chart.figure["layout"]["yaxis"]["ticktext"] == ["the old world", "range 15 m"]
+    (trace,) = chart.figure["data"]
+    assert (trace["x"], trace["y"]) == ([90.0, 80.0], [0.0, 1.0])
+    assert [line[:3] for line in chart.lines[1:]] == [
+        ["the old world", "oracle", "90.0"],
+        ["range 15 m", "oracle", "80.0"],
+    ]
 
 
 def test_a_method_has_one_colour_in_figures_and_on_the_page() -> None:
@@ -283,6 +302,7 @@ def test_sections_without_data_say_why_they_are_left_out(bare: str) -> None:
     for name, reason in (
         ("curves", "the study's folder has no learning curves"),
         ("conditions", "the conditions of their training alone"),
+        ("worlds", "among the drivers of their training alone"),
         ("player", "none of the study's policies can be loaded"),
         ("failures", "no episodes were recorded"),
         ("latents", "no method of the study infers traits with a model"),

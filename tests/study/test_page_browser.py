@@ -11,7 +11,9 @@ import pytest
 
 from tests.study.browser import FLAGS, require_browser
 from tests.study.pages import small_page
+from tint_sumo.study.page import write_page
 from tint_sumo.study.page.recording import UNITS, read_episodes
+from tint_sumo.study.report import write_report
 
 sync_api = pytest.importorskip("playwright.sync_api", reason='no browser tests without: pip install "tint_sumo[dev]"')
 axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason='needs: pip install "tint_sumo[dev]"')
@@ -32,7 +34,19 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     require_browser()
     out = tmp_path_factory.mktemp("study")
     small_page(out)
+    hide_a_vehicle(out / "episodes" / "ttc.json")
+    write_page(write_report(out), out, progress=False)
     return out
+
+
+def hide_a_vehicle(file: Path) -> None:
+    """As a sensor does; and let the policy estimate the town."""
+    content = json.loads(file.read_text())
+    episode = content["episodes"]["0"]
+    first = next(one for one in episode["vehicles"] if one["first"] == 0)
+    first["seen"] = [0] * len(first["x_m"])
+    episode["ego"] |= {"town_rank": [79], "town_differs": [92]}
+    file.write_text(json.dumps(content))
 
 
 @pytest.fixture(scope="module")
@@ -158,13 +172,26 @@ def test_inferred_traits_attention_and_claims_are_seen_and_told(opened: Opened, 
     assert "lower" in opened.facts()["claims"]
     assert float(opened.facts()["value"]) != 0.0
     rows = [row.split("\t") for row in pane.locator("table").inner_text().splitlines()]
-    assert rows[0] == ["vehicle", "true trait", "taken for", "attention", "brakes"]
+    assert rows[0] == ["vehicle", "true trait", "taken for", "attention", "brakes", "seen"]
     assert len(rows) == len(opened.places())
+    assert {row[5] for row in rows[1:]} == {"yes"} and pane.locator("g.hidden").count() == 0
     hatched = sum(row[2].startswith("aggressive") for row in rows[1:])
     assert pane.locator("g.hatched").count() == hatched > 0
     weights = [int(row[3].split()[0]) for row in rows[1:]]
     assert sum(weights) == pytest.approx(100, abs=len(weights))
     assert pane.locator("circle.halo").count() == pytest.approx(sum(weight > 3 for weight in weights), abs=1)
+
+
+def test_vehicles_that_are_not_seen_are_pale_and_the_town_is_described(opened: Opened) -> None:
+    choose(opened, "ttc", "0")
+    pane = opened.page.locator(".pane").nth(0)
+    pane.locator("summary").click()
+    assert opened.facts()["town"] == "gaps longer than in 79 % of towns, drivers differ with 92 %"
+    hidden = pane.locator("svg g.hidden")
+    assert hidden.count() == 1 and hidden.evaluate("one => getComputedStyle(one).opacity") == "0.35"
+    assert hidden.locator("title").text_content().endswith(", not seen")
+    rows = [row.split("\t") for row in pane.locator("table").inner_text().splitlines()]
+    assert sorted({row[5] for row in rows[1:]}) == ["no", "yes"]
 
 
 def test_every_button_and_key_moves_both_policies_through_the_same_case(opened: Opened) -> None:

@@ -19,6 +19,7 @@ from tint_sumo.study.summary import Row, tabulate
 
 AS_TRAINED, NOISY, HALF = Conditions(ALL_MIXES), Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, percent=50)
 CURVE = "decisions,success,timeout,collision\n64,0.1,0.4,0.5\n128,0.6,0.1,0.3\n"
+IN_WORLDS = [Conditions(ALL_MIXES, world=world) for world in ("old", "headway_1.5")]
 CEILINGS = {"0.25": 0.875, "0.4": 1.0}
 OUTCOMES = ("success", "timeout", "collision")
 
@@ -32,6 +33,7 @@ def policy(method: str, seed: int, success: int) -> Result:
         AS_TRAINED: (success - 1, timeout, collision + 1),
         NOISY: (success - 3, timeout, collision + 3),
         HALF: (success - 4, timeout, collision + 4),
+        **{world: (success - 5 * number, 5 * number + 1, 19 - success) for number, world in enumerate(IN_WORLDS)},
     }
     return trained(method, seed, tested)
 
@@ -80,7 +82,7 @@ def tables(markdown: str) -> dict[str, list[list[str]]]:
 
 def test_every_file_is_written_and_nothing_else(study: Path, report: StudyReport) -> None:
     assert report.markdown_file.read_text() == report.markdown
-    assert [file.name for file in report.figure_files] == ["results.png", "conditions.png", "curves.png"]
+    assert [file.name for file in report.figure_files] == ["results.png", "conditions.png", "worlds.png", "curves.png"]
     for file in report.figure_files:
         with Image.open(file) as figure:
             assert figure.format == "PNG" and figure.width > 500
@@ -95,7 +97,7 @@ def test_every_file_is_written_and_nothing_else(study: Path, report: StudyReport
 def test_the_csv_file_has_a_line_for_every_row_and_the_documented_columns(report: StudyReport) -> None:
     with report.csv_file.open(newline="") as file:
         lines = list(csv.DictReader(file))
-    conditions = ["p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent"]
+    conditions = ["p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent", "world"]
     closing = ["navigation_time_s", "episodes", "seeds", "ceiling_percent"]
     measured = [f"{outcome}{part}_percent" for outcome in OUTCOMES for part in ("", "_low", "_high", "_sd")]
     paper = [f"paper_{outcome}_percent" for outcome in OUTCOMES]
@@ -159,6 +161,26 @@ def test_every_table_of_several_seeds_is_there(report: StudyReport) -> None:
         "Collisions by trait and route",
         "Differences in success",
         "Other conditions and shorter trainings",
+        "Worlds",
+    ]
+
+
+def test_worlds_are_rows_with_all_outcomes_of_each_method(report: StudyReport) -> None:
+    assert tables(report.markdown)["Worlds"] == [
+        ["world", "no labels", "paper's method", "oracle"],
+        ["the old world", "35/5/60", "68/5/27", "93/5/2"],
+        ["headway 1.5 s", "10/30/60", "43/30/27", "68/30/2"],
+    ]
+
+
+def test_a_table_of_earlier_versions_knows_no_worlds(report: StudyReport, tmp_path: Path) -> None:
+    lines = [line for line in csv.DictReader(report.csv_file.read_text().splitlines()) if not line["world"]]
+    with (tmp_path / "old.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, [name for name in lines[0] if name != "world"], extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(lines)
+    assert [row.conditions for row in read_csv(tmp_path / "old.csv")[0]] == [
+        row.conditions for row in report.rows if row.conditions.world is None
     ]
 
 
@@ -228,7 +250,7 @@ def test_other_conditions_stand_beside_those_of_the_training(report: StudyReport
 
 def test_a_study_with_one_seed_and_no_curves_has_no_differences(tmp_path: Path) -> None:
     report = write_report(write_results(ONE_SEED, tmp_path))
-    assert [file.name for file in report.figure_files] == ["results.png", "conditions.png"]
+    assert [file.name for file in report.figure_files] == ["results.png", "conditions.png", "worlds.png"]
     found = tables(report.markdown)
     assert "Differences in success" not in found
     assert found["Success by mix of drivers"] == [
@@ -247,7 +269,11 @@ def test_a_study_in_one_set_of_conditions_has_one_figure(tmp_path: Path) -> None
 def test_a_training_without_an_episode_yet_has_no_curve(tmp_path: Path) -> None:
     write_results(ONE_SEED, tmp_path)
     write_text(tmp_path / "policies" / "oracle-P0.1to0.9-seed0" / CURVE_FILE, CURVE.splitlines()[0] + "\n")
-    assert [file.name for file in write_report(tmp_path).figure_files] == ["results.png", "conditions.png"]
+    assert [file.name for file in write_report(tmp_path).figure_files] == [
+        "results.png",
+        "conditions.png",
+        "worlds.png",
+    ]
 
 
 @pytest.mark.parametrize("file", [CEILINGS_FILE, f"policies/oracle-P0.1to0.9-seed0/{CURVE_FILE}"])

@@ -17,7 +17,7 @@ from tint_sumo.study.results import Result, read_results
 SOME_RESULTS = [
     trained("oracle", 1, {Conditions(Mix(0.4)): (8, 1, 1), Conditions(ALL_MIXES, 0.05, 0.7, 25): (3, 0, 2)}),
     trained("vae", 0, {Conditions(Mix(0.25)): (1, 0, 0)}, mix=Mix(0.25)),
-    given("ttc", {Conditions(Mix(0.25)): (0, 0, 3)}),
+    given("ttc", {Conditions(Mix(0.25)): (0, 0, 3), Conditions(ALL_MIXES, world="acc"): (1, 1, 1)}),
 ]
 
 

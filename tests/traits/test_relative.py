@@ -10,7 +10,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
 from tint_sumo.scenes import paper_scene
 from tint_sumo.traits.perceived import Explorer, Perceived, perceive
-from tint_sumo.traits.relative import RelativeStream, densities, learn, numbers, prior, probability
+from tint_sumo.traits.relative import RelativeStream, TownEstimate, densities, learn, numbers, prior, probability
 from tint_sumo.traits.relative_fit import fit_relative, follow, traffic
 from tint_sumo.traits.relative_reading import Reading, Readings, read
 
@@ -113,6 +113,25 @@ def test_drivers_who_have_left_still_count_for_the_town() -> None:
     never = replace(whole, present=whole.present.copy())
     never.present[:, :, 1:] = False
     assert beliefs(GAP_ONLY, never)[0] > beliefs(GAP_ONLY, whole)[0] + 0.2
+
+
+def test_the_town_is_estimated_from_all_drivers_so_far() -> None:
+    def town(gaps_m: list[float]) -> TownEstimate:
+        stream, seen = RelativeStream(GAP_ONLY, 1, len(gaps_m)), platoon(gaps_m, 81)
+        stream.begin(np.array([0]))
+        for present, position_m, gap_m in zip(seen.present, seen.position_m, seen.gap_m, strict=True):
+            stream.advance(np.array([0]), present, position_m, gap_m)
+        before = stream.town(0)
+        assert stream.town(0) == before, "looking changes nothing"
+        return before
+
+    nobody = RelativeStream(GAP_ONLY, 1, 2)
+    nobody.begin(np.array([0]))
+    assert nobody.town(0).rank == pytest.approx(0.5)
+    assert nobody.town(0).differs == pytest.approx(0.75)
+    alike, apart = town([6.0] * 6), town([5.5, 6.5] * 3)
+    assert alike.rank > 0.7 and town([4.0] * 6).rank < 0.3
+    assert alike.differs < 0.6 and apart.differs > 0.9
 
 
 def test_traits_follow_from_the_past_of_the_episode_alone(seen: Perceived) -> None:

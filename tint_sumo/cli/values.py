@@ -96,7 +96,7 @@ FolderOrUrl = Annotated[str, arg(metavar="FOLDER|URL")]  # a path would lose a s
 SceneValue = Annotated[Any, name_flag(), SCENE]
 SensorValue = Annotated[Any, name_flag(*SENSORS), SENSOR]
 PopulationValue = Annotated[Any, name_flag(*POPULATIONS), POPULATION]
-BudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), BUDGET]
+BudgetValue = Annotated[Any, name_flag("quick", "full", "strangers", "paper"), BUDGET]
 PpoBudgetValue = Annotated[Any, name_flag("quick", "full", "strangers", "paper"), PPO_BUDGET]
 TraitBudgetValue = Annotated[Any, name_flag("quick", "full", "paper"), TRAIT_BUDGET]
 TraitStudyValue = Annotated[Any, name_flag("full"), TRAIT_STUDY]

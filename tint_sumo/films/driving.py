@@ -15,12 +15,13 @@ from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.methods.evaluation import Case, evaluate
 from tint_sumo.methods.loading import Contender
 from tint_sumo.policy.network import GruPolicy
-from tint_sumo.policy.trait_sources import Observation, OracleTraits, one_hot
-from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS
+from tint_sumo.policy.trait_sources import NeighbourTraits, Observation, OracleTraits, one_hot
+from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS, source_of
 from tint_sumo.scenes.geometry import Bools, Boxes, Floats, Numbers
 from tint_sumo.scenes.scene import Building
 from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation import SceneSimulation, Simulation
+from tint_sumo.traits.relative import TownEstimate
 
 _BRAKING_MPS2 = 0.5  # vehicles that slow down by more than this show it
 
@@ -44,6 +45,7 @@ class Moment:
     traits: Numbers  # (V,) true ones: numbers of profiles, -1 in empty slots
     observed_traits: Floats | None  # (V, Z) traits in the policy's observation; None where it has none
     attention: Floats | None  # (V,)
+    town: TownEstimate | None  # of policies that compare the drivers of a town
     claimed: Bools  # (K,); of no routes in a SUMO configuration
     desired_mps: float | None  # the policy's action; None before its first, and where SUMO's driver drives
     value: float | None  # return that the policy expected when it chose the action
@@ -100,6 +102,8 @@ class _Recorder:
         assert isinstance(base, SceneVecEnv) and isinstance(base.env.batch, LocalBatch)
         simulation = base.env.batch.episodes.simulation
         self._simulation = simulation
+        source = source_of(venv)
+        self._neighbours = source if isinstance(source, NeighbourTraits) else None
         self._episodes = base.env.batch.episodes
         self._speeds = _Speeds(simulation)
 
@@ -160,6 +164,7 @@ class _Recorder:
                 traits=simulation.traits()[0],
                 observed_traits=self._by_vehicle(observation[TRAITS][0]) if TRAITS in observation else None,
                 attention=None if attention is None else self._by_vehicle(attention),
+                town=None if self._neighbours is None else self._neighbours.town(0),
                 claimed=_claimed(simulation),
                 desired_mps=self._desired_mps,
                 value=self._value,

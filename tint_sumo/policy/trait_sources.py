@@ -21,7 +21,7 @@ from tint_sumo.dataset.windows import cut_windows
 from tint_sumo.traits.classifier import Classifier
 from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.model import TraitModel
-from tint_sumo.traits.relative import LATENTS, RelativeStream
+from tint_sumo.traits.relative import LATENTS, RelativeStream, TownEstimate
 from tint_sumo.traits.streaming import TrackStream
 
 Observation = dict[str, np.ndarray]
@@ -278,6 +278,10 @@ class NeighbourTraits(TraitSource):
 
     def advance(self, frame: Frame) -> None:
         self._follow(frame, np.arange(len(frame.done)))
+
+    def town(self, env: int) -> TownEstimate:
+        """Return what is known of the town of an environment's episode."""
+        return self._stream.town(env)
 
     def _follow(self, frame: Frame, envs: np.ndarray) -> None:
         """Take one more step of the tracks in some environments."""

@@ -15,7 +15,7 @@ from tint_sumo.envs.batch import Snapshot
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import COST
 from tint_sumo.envs.sb3 import SceneVecEnv
-from tint_sumo.policy.trait_sources import Frame, Observation, OracleTraits, TraitSource
+from tint_sumo.policy.trait_sources import Frame, Observation, OracleTraits, TraitSource, WithMotion
 
 TRAITS, TRUE_TRAITS = "traits", "true_traits"
 _NEEDED = frozenset({"ego", "vehicles", "mask"})
@@ -152,6 +152,15 @@ class ActionRepeat(VecEnvWrapper):
                 terminal = {env: infos[env]["terminal_observation"] for env in np.flatnonzero(done).tolist()}
                 self._on_step(_continued(_dictionary(observation), terminal), infos)
         return observation, total, ended, last
+
+
+def source_of(venv: VecEnv) -> TraitSource | None:
+    """Return the source of the traits in the observations of vectorised environments; None if these have no traits."""
+    while isinstance(venv, VecEnvWrapper):
+        if isinstance(venv, TraitObservation) and venv.key == TRAITS:
+            return venv.source.inner if isinstance(venv.source, WithMotion) else venv.source
+        venv = venv.venv
+    return None
 
 
 def policy_venv(

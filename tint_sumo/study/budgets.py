@@ -5,7 +5,9 @@ from typing import Annotated
 
 from tint_sumo.config import (
     ALL_MIXES,
+    HELD_OUT_WORLDS,
     P_CONSERVATIVE,
+    PERFECT,
     PPO_BUDGETS,
     SNAPSHOTS_PERCENT,
     TRAIT_BUDGETS,
@@ -22,8 +24,11 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.ranges import Range, require_distinct, require_ranges, set_floats
 from tint_sumo.core.structures import Many
 from tint_sumo.envs import TaskSettings
+from tint_sumo.envs.worlds import find_world, scene_in, task_in
 from tint_sumo.methods.registry import built_in_methods
-from tint_sumo.scenes import AnyScene
+from tint_sumo.scenes import AnyScene, Scene, paper_scene
+
+STRANGERS_TESTS = ("old", "towns", *HELD_OUT_WORLDS)  # worlds in which policies that drive among strangers are tested
 
 
 @dataclass(frozen=True)
@@ -34,10 +39,15 @@ class Conditions:
     position_noise_m: NoiseM = 0.0
     tau_s: TauS | None = None  # time headway of the other drivers; None: the scene's
     percent: int = 100  # part of the training after which the policy is tested
+    world: str | None = None  # name of a world; None: the drivers of the training, and a perfect sensor
 
     def __post_init__(self) -> None:
         require_ranges(self)
         set_floats(self, "position_noise_m", "tau_s")
+        if self.world is not None:
+            _ = self.task(paper_scene())  # there is such a world, and it is one for tests
+            if self.position_noise_m or self.tau_s is not None:
+                raise InputError("a world has a sensor and a headway; leave position_noise_m and tau_s out beside it")
         if self.percent not in (*SNAPSHOTS_PERCENT, 100):
             kept = ", ".join(map(str, (*SNAPSHOTS_PERCENT, 100)))
             raise InputError(f"percent must be one of {kept}, when policies are kept, not {self.percent}")
@@ -48,12 +58,15 @@ class Conditions:
         return self.p_conservative.is_single and self == Conditions(self.p_conservative)
 
     def task(self, scene: AnyScene) -> TaskSettings:
-        """Return the settings of environments in a scene."""
+        """Return the settings of environments in a scene, or in its world."""
+        if self.world is not None:
+            return task_in(find_world(self.world), TaskSettings(scene, self.p_conservative))
         return TaskSettings(scene, self.p_conservative, sensor=Sensor(noise_m=self.position_noise_m), tau_s=self.tau_s)
 
     def resolved(self, scene_tau_s: float) -> "Conditions":
-        """Return these conditions with the headway of the scene's drivers where none is given."""
-        return self if self.tau_s is not None else replace(self, tau_s=scene_tau_s)
+        """Return these conditions with the headway of the scene's drivers where neither it nor a world is given."""
+        is_given = self.tau_s is not None or self.world is not None
+        return self if is_given else replace(self, tau_s=scene_tau_s)
 
     def relative_to(self, scene_tau_s: float) -> "Conditions":
         """Return these conditions with None for a headway that is the scene's: the form in which they are compared."""
@@ -63,6 +76,7 @@ class Conditions:
     def label(self) -> str:
         """The values that differ from the conditions of the training, for tables and figures."""
         parts = [
+            "" if self.world is None else find_world(self.world).title,
             f"noise {self.position_noise_m:g} m" if self.position_noise_m else "",
             f"tau {self.tau_s:g} s" if self.tau_s is not None else "",
             f"{self.percent} % of training" if self.percent != 100 else "",
@@ -93,6 +107,7 @@ class Budget:
     windows: Annotated[int, Range(0, 100_000_000)] = 0  # windows to record for them
     record_p_conservative: Fraction = 0.5  # share of conservative drivers in the dataset
     ppo: PpoSettings = field(default_factory=PpoSettings)  # settings of PPO, and the steps of every policy
+    world: str | None = None  # name of the world of the trainings; None: the scene's drivers, and a perfect sensor
     methods: Many[str] = ("always_go", "ttc", "no_labels", "vae", "oracle")
     mixes: Many[Mix] = (ALL_MIXES,)  # P(conservative) in training: a policy for each
     seeds: Many[Seed] = (0, 1, 2)
@@ -102,6 +117,8 @@ class Budget:
     def __post_init__(self) -> None:
         require_distinct(self, "methods", "mixes", "seeds")
         require_ranges(self)
+        if self.world is not None:
+            find_world(self.world)
         if self.traits is not None and self.windows == 0:
             raise InputError("windows must be at least 1, not 0")
         if self.traits is None and (self.windows, self.record_p_conservative) != (0, Budget.record_p_conservative):
@@ -109,6 +126,15 @@ class Budget:
                 "windows are recorded to learn traits from; give traits, or windows: 0 and "
                 f"record_p_conservative: {Budget.record_p_conservative:g}"
             )
+
+    def trained_in(self, scene: Scene) -> Scene:
+        """Return a scene with the drivers of the trainings."""
+        return scene if self.world is None else scene_in(find_world(self.world), scene)
+
+    @property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """Sensors of the trainings."""
+        return (PERFECT,) if self.world is None else find_world(self.world).sensors
 
 
 BUDGETS = {
@@ -137,6 +163,15 @@ BUDGETS = {
                 300,
             ),
         ),
+    ),
+    "strangers": Budget(
+        traits=TRAIT_BUDGETS["full"],
+        windows=696_000,
+        ppo=PPO_BUDGETS["strangers"],
+        world="strangers",
+        methods=(*built_in_methods(), "relative"),
+        seeds=(0, 1, 2, 3, 4),
+        trials=(Trials(tuple(Conditions(ALL_MIXES, world=name) for name in STRANGERS_TESTS), 300),),
     ),
     "paper": Budget(
         traits=TRAIT_BUDGETS["paper"],

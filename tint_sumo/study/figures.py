@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from tint_sumo.core.files import whole_file
 from tint_sumo.core.percentages import percent
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
+from tint_sumo.envs.worlds import find_world
 from tint_sumo.methods.registry import METHODS, look_of
 from tint_sumo.study.jobs import smoothed_percent
-from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, varied
+from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, by_world, varied
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
 INK = {"success": "white", "timeout": "black", "collision": "white"}  # colours of the numbers on these colours
@@ -107,6 +108,29 @@ def plot_conditions(rows: Sequence[Summary], file: Path) -> Path:
         axes.set_xlabel(title)
         axes.grid(alpha=0.25)
     all_axes[0].set_ylabel("success, all mixes (%)")
+    entries = all_axes[0].get_legend_handles_labels()
+    figure.legend(*entries, loc="outside lower center", ncols=6, frameon=False, fontsize=8)
+    return _write(figure, file)
+
+
+def plot_worlds(rows: Sequence[Summary], file: Path) -> Path:
+    """Draw success and collisions with 95 % intervals: a line for each world, a marker for each method."""
+    worlds, methods = by_world(rows), by_title(rows)
+    figure = Figure(figsize=(11.0, 1.6 + 0.42 * len(worlds)), dpi=150, layout="constrained")
+    all_axes = figure.subplots(1, 2, sharey=True)
+    for axes, outcome in zip(all_axes, ("success", "collision"), strict=True):
+        for position, found in enumerate(methods.values()):
+            shift = 0.0 if len(methods) == 1 else 0.32 * (2 * position / (len(methods) - 1) - 1)
+            heights = [list(worlds).index(str(row.conditions.world)) + shift for row in found]
+            rates = np.array([100.0 * row.rate(outcome) for row in found])
+            limits = 100.0 * np.array([row.intervals[outcome] for row in found]).T
+            style = _line_style(found[0].method, is_open=found[0].is_shipped) | {"linestyle": "none", "elinewidth": 0.8}
+            axes.errorbar(rates, heights, xerr=np.abs(limits - rates), label=found[0].title, **style)
+        axes.set_xlabel(f"{outcome}, all mixes (%)")
+        axes.set_xlim(left=-1.0, right=101.0 if outcome == "success" else None)
+        axes.grid(alpha=0.25)
+    all_axes[0].set_yticks(range(len(worlds)), [find_world(world).title for world in worlds], fontsize=8)
+    all_axes[0].invert_yaxis()
     entries = all_axes[0].get_legend_handles_labels()
     figure.legend(*entries, loc="outside lower center", ncols=6, frameon=False, fontsize=8)
     return _write(figure, file)

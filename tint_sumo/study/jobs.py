@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from tint_sumo.config import Mix, PpoSettings
+from tint_sumo.config import PERFECT, Mix, PpoSettings, Sensor
 from tint_sumo.core.files import damaged, write_json
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Report, part_of
@@ -37,6 +37,7 @@ class TrainJob:
     shipped_traits: bool  # rather than a trait model of the study
     out: Path  # folder of the study
     scene: Scene = field(default_factory=paper_scene)
+    sensors: tuple[Sensor, ...] = (PERFECT,)  # of several, each has an equal share of the environments
 
     uses_gpu = True
 
@@ -87,6 +88,7 @@ class TrainJob:
             self.folder,
             settings=self.settings,
             scene=self.scene,
+            sensors=self.sensors,
             traits=traits,
             report=report,
         )

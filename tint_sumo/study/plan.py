@@ -22,7 +22,8 @@ from tint_sumo.study.trait_job import SEED, TraitJob
 
 def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
     """Return all jobs after the recording, seed by seed, those first that others wait for or that take longest."""
-    scene = scene or paper_scene()
+    base = scene or paper_scene()
+    scene = budget.trained_in(base)
     learned = [name for name in budget.methods if isinstance(find_method(name), Learned)]
     rules = [name for name in budget.methods if name not in learned]
     for method in map(find_method, rules):
@@ -33,12 +34,12 @@ def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
         find_learned(name).settings_of(budget.ppo)  # refuses what does not fit before hours of work
     encoders = dict.fromkeys(filter(None, (find_learned(name).encoder for name in trained)))
     traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
-    given = rules + (shipped_policies() if budget.with_shipped and scene == paper_scene() else [])
+    given = rules + (shipped_policies() if budget.with_shipped and base == paper_scene() else [])
     trials = tuple(trials.relative_to(scene.tau_s) for trials in budget.trials)
     jobs: list[Job] = [*traits]
     for seed in budget.seeds:
         trainings = [
-            TrainJob(name, mix, seed, budget.ppo, budget.traits is None, out, scene)
+            TrainJob(name, mix, seed, budget.ppo, budget.traits is None, out, scene, budget.sensors)
             for mix in budget.mixes
             for name in trained
         ]
@@ -65,9 +66,10 @@ def run_study(
         JobError: jobs were given up; all others are done.
     """
     executor = executor_of(workers)
-    found = require_scene("a study", find_scene(scene))
+    base = require_scene("a study", find_scene(scene))
+    found = budget.trained_in(base)
     _require_traits(budget, found)
-    jobs = plan(budget, out, found)
+    jobs = plan(budget, out, base)
     scene_entries = {} if found == paper_scene() else described([found])
     with claim_folder(out, {"kind": "study", **plain(budget), **scene_entries}):
         if budget.traits is not None:

@@ -9,12 +9,23 @@ from tint_sumo.core.files import write_text
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.statistics import difference_interval
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
+from tint_sumo.envs.worlds import find_world
 from tint_sumo.study.ceiling_job import read_ceilings
-from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves
+from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_worlds
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.results import read_results
 from tint_sumo.study.results_csv import Ceilings, to_csv
-from tint_sumo.study.summary import Row, Summary, at_mixes, by_method, by_title, over_all_mixes, tabulate
+from tint_sumo.study.summary import (
+    Row,
+    Summary,
+    at_mixes,
+    by_method,
+    by_title,
+    by_world,
+    in_worlds,
+    over_all_mixes,
+    tabulate,
+)
 from tint_sumo.study.tables import Lines, Table
 
 
@@ -43,6 +54,8 @@ def write_report(out: Path) -> StudyReport:
         figures.append(plot_bars(at_mixes(rows), out / "results.png"))
     if over_all_mixes(rows):
         figures.append(plot_conditions(over_all_mixes(rows), out / "conditions.png"))
+    if in_worlds(rows):
+        figures.append(plot_worlds(in_worlds(rows), out / "worlds.png"))
     if curves := read_curves(out):
         figures.append(plot_curves(curves, out / "curves.png"))
     tables = result_tables(rows, ceilings)
@@ -69,6 +82,8 @@ def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
         tables.append(Table("Differences in success", _difference_lines(main), _DIFFERENCE_NOTE))
     if varied:
         tables.append(Table("Other conditions and shorter trainings", _condition_lines(varied), _CONDITIONS_NOTE))
+    if in_worlds(rows):
+        tables.append(Table("Worlds", _world_lines(in_worlds(rows)), _WORLDS_NOTE))
     return tables
 
 
@@ -90,6 +105,10 @@ _DIFFERENCE_NOTE = (
 _CONDITIONS_NOTE = (
     "Success (collision) in percent; every case has its own P(conservative) between 0.1 and 0.9. The first column is "
     "the conditions of the training."
+)
+_WORLDS_NOTE = (
+    "Success / timeout / collision in percent; every case has its own P(conservative) between 0.1 and 0.9. A world is "
+    "a population of drivers and a sensor."
 )
 
 
@@ -170,6 +189,15 @@ def _condition_lines(rows: Sequence[Summary]) -> Lines:
         rates = {row.conditions: [percent(row.rate(outcome)) for outcome in ("success", "collision")] for row in found}
         cells = ["{} ({})".format(*rates[conditions]) if conditions in rates else "-" for conditions in varied]
         lines.append([title, *cells])
+    return lines
+
+
+def _world_lines(rows: Sequence[Summary]) -> Lines:
+    titles = list(by_title(rows))
+    lines = [["world", *titles]]
+    for world, found in by_world(rows).items():
+        at = {row.title: "/".join(f"{100 * row.rate(outcome):.0f}" for outcome in BUILT_IN_OUTCOMES) for row in found}
+        lines.append([find_world(world).title, *(at.get(title, "-") for title in titles)])
     return lines
 
 

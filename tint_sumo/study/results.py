@@ -69,7 +69,7 @@ class _StoredTest:
 
     p_conservative: Mix
     position_noise_m: NoiseM
-    tau_s: TauS
+    tau_s: TauS | None  # None in a world
     percent: int
     success: float
     timeout: float
@@ -79,15 +79,18 @@ class _StoredTest:
     navigation_time_s: float | None
     collisions: Mapping[str, int]
     cases: tuple[StoredCase, ...]
+    world: str | None = None
 
     def __post_init__(self) -> None:
         _ = self.conditions  # they are checked
+        if self.tau_s is None and self.world is None:
+            raise InputError("tau_s must be a number outside of a world")
         if not self.cases:
             raise InputError("there are no cases")
 
     @property
     def conditions(self) -> Conditions:
-        return Conditions(self.p_conservative, self.position_noise_m, self.tau_s, self.percent)
+        return Conditions(self.p_conservative, self.position_noise_m, self.tau_s, self.percent, self.world)
 
     def measured(self, scene_tau_s: float) -> Measured:
         evaluation = Evaluation(tuple(Case(*case) for case in self.cases))

@@ -17,7 +17,7 @@ from tint_sumo.study.summary import Summary
 Ceilings = Mapping[float, float]  # share of the cases that a careful driver can finish, by P(conservative)
 
 _PARTS = ("", "_low", "_high", "_sd")  # a rate, the ends of its interval, its spread between seeds
-_CONDITIONS = ("p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent")
+_CONDITIONS = ("p_conservative", "position_noise_m", "tau_s", "scene_tau_s", "training_percent", "world")
 COLUMNS = (
     *("method", "origin", "trained_p_conservative", *_CONDITIONS),
     *(f"{outcome}{part}_percent" for outcome in BUILT_IN_OUTCOMES for part in _PARTS),
@@ -71,7 +71,8 @@ def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
         writer.writerow(
             [
                 *(row.method, row.origin, "" if row.mix is None else row.mix.text, p.text),
-                *(f"{value:g}" for value in tested),
+                *("" if value is None else f"{value:g}" for value in tested),
+                conditions.world or "",
                 *numbers,
                 "" if time_s is None else f"{time_s:.2f}",
                 row.episodes,
@@ -109,12 +110,14 @@ def _row(line: Mapping[str, str]) -> StoredRow:
         rates[outcome], limits[outcome] = _read_percent(rate), (_read_percent(low), _read_percent(high))
         spreads[outcome] = _read_percent(spread) if spread else None
     mix, time_s = line["trained_p_conservative"], line["navigation_time_s"]
-    p, noise_m, tau_s, scene_tau_s, percent = (line[name] for name in _CONDITIONS)
+    p, noise_m, tau_s, scene_tau_s, percent = (line[name] for name in _CONDITIONS[:-1])
+    world = line.get("world") or None  # tables of earlier versions have no such column
+    given_tau_s = float(tau_s) if tau_s else None
     return StoredRow(
         line["method"],
         line["origin"],
         Mix.from_text(mix) if mix else None,
-        Conditions(Mix.from_text(p), float(noise_m), float(tau_s), int(percent)).relative_to(float(scene_tau_s)),
+        Conditions(Mix.from_text(p), float(noise_m), given_tau_s, int(percent), world).relative_to(float(scene_tau_s)),
         tuple(map(int, line["seeds"].split())),
         float(scene_tau_s),
         int(line["episodes"]),

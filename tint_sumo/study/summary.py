@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from tint_sumo.config import Mix
+from tint_sumo.config import WORLDS, Mix
 from tint_sumo.core.statistics import Hits, Interval, rate_interval
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.evaluation import Evaluation
@@ -132,6 +132,7 @@ class Row(Summary):
             "position_noise_m": self.conditions.position_noise_m,
             "tau_s": self.resolved.tau_s,
             "percent": self.conditions.percent,
+            "world": self.conditions.world,
             "seeds": list(self.seeds),
             "episodes": self.episodes,
             **{outcome: self.rate(outcome) for outcome in BUILT_IN_OUTCOMES},
@@ -155,6 +156,7 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
         result, conditions = pair[0], pair[1].conditions
         headway_s = 0.0 if conditions.tau_s is None else conditions.tau_s - result.scene_tau_s
         return (
+            -1 if conditions.world is None else list(WORLDS).index(conditions.world),
             -conditions.percent,
             conditions.position_noise_m,
             abs(headway_s),  # the difference from the scene's
@@ -186,7 +188,13 @@ def at_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
 
 def over_all_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
     """Return the rows of other conditions and parts of the training, where every case draws its mix."""
-    return [row for row in rows if not row.conditions.p_conservative.is_single]
+    return [row for row in rows if not row.conditions.p_conservative.is_single and row.conditions.world is None]
+
+
+def in_worlds(rows: Sequence[AnyRow]) -> list[AnyRow]:
+    """Return the rows of fully trained policies in worlds, where every case draws its mix."""
+    found = [row for row in rows if row.conditions.world is not None and row.conditions.percent == 100]
+    return [row for row in found if not row.conditions.p_conservative.is_single]
 
 
 def by_method(rows: Sequence[AnyRow]) -> list[AnyRow]:
@@ -201,6 +209,11 @@ def by_title(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
     for row in by_method(rows):
         found.setdefault(row.title, []).append(row)
     return found
+
+
+def by_world(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
+    """Return the rows of each world, in the order of ``WORLDS``."""
+    return {world: found for world in WORLDS if (found := [row for row in rows if row.conditions.world == world])}
 
 
 def varied(rows: Sequence[AnyRow], name: str) -> dict[float, AnyRow]:

@@ -16,6 +16,7 @@ The weights of x, the distributions of T and D among towns, s and k are fitted t
 (``tint_sumo.traits.relative_fit``).
 """
 
+import math
 from dataclasses import astuple, dataclass
 from typing import Self
 
@@ -71,6 +72,14 @@ class _Memory:
         )
 
 
+@dataclass(frozen=True)
+class TownEstimate:
+    """Estimate of the town that an episode is in."""
+
+    rank: float  # share of all towns whose drivers keep shorter gaps
+    differs: float  # probability that its two groups of drivers differ at all
+
+
 class RelativeStream:
     """Relative traits of the vehicles that N egos see in V slots, with every step of 0.1 s.
 
@@ -85,6 +94,7 @@ class RelativeStream:
         self._memory = _Memory.empty(num_envs, slots, self._prior.shape)
         self._limits = np.array(astuple(settings.steady))
         self._latent = numbers(settings.latent)
+        self._town_std = settings.latent.town_std
 
     @property
     def total(self) -> Floats:
@@ -126,6 +136,16 @@ class RelativeStream:
             _infer(due, self._latent, m.seen, m.total, m.count, m.town, m.traits)
         m.step[envs] += 1
         return np.asarray(m.traits[envs])
+
+    def town(self, env: int) -> TownEstimate:
+        """Return what an environment's drivers say about their town so far, those who have left included."""
+        m, differences = self._memory, self._prior.shape[1]
+        town = m.town[env].copy()
+        for slot in np.flatnonzero(m.seen[env] & (m.count[env] > 0)).tolist():
+            learn(town, densities(m.total[env, slot], m.count[env, slot], self._latent, differences))
+        deviation = GRID * (np.arange(TOWNS) - TOWNS // 2)
+        level = float(town.sum(axis=(0, 1)) @ deviation) / self._town_std
+        return TownEstimate(0.5 * (1.0 + math.erf(level / math.sqrt(2.0))), 1.0 - float(town[:, 0].sum()))
 
 
 def numbers(latent: RelativeLatent) -> Floats:

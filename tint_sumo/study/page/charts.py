@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 
 from tint_sumo.core.percentages import percent
+from tint_sumo.envs.worlds import find_world
 from tint_sumo.methods.registry import METHODS, Look, look_of
 from tint_sumo.study.jobs import smoothed_percent
-from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, varied
+from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, by_world, varied
 from tint_sumo.study.tables import Lines
 
 # Plotly's names for Matplotlib's markers and line styles.
@@ -61,12 +62,7 @@ def outcome_chart(rows: Sequence[Summary], outcome: str) -> Chart:
     layout = {
         "height": 120 + _ROW_PX * len(titles),
         "xaxis": {"title": {"text": f"{outcome}, % of the cases"}, "range": [-1, 101]},
-        "yaxis": {
-            "tickvals": list(range(len(titles))),
-            "ticktext": titles,
-            "range": [len(titles) - 0.5, -0.5],
-            "zeroline": False,
-        },
+        "yaxis": _row_axis(titles),
     }
     description = f"{outcome} by method and mix of drivers, with 95 % intervals"
     return Chart(outcome, description.capitalize(), lines, {"data": traces, "layout": layout})
@@ -118,6 +114,39 @@ def condition_charts(rows: Sequence[Summary]) -> list[Chart]:
             }
             charts.append(Chart(name, f"Success by {title}", lines, {"data": traces, "layout": layout}))
     return charts
+
+
+def world_chart(rows: Sequence[Summary], outcome: str) -> Chart:
+    """Return the chart of an outcome's rates in each world: a line for each world, a marker for each method."""
+    worlds, methods = by_world(rows), by_title(rows)
+    names = [find_world(world).title for world in worlds]
+    traces, lines = [], [["world", "method", f"{outcome} %", "95 % interval"]]
+    for position, (title, shown_rows) in enumerate(methods.items()):
+        shift = 0.0 if len(methods) == 1 else 0.3 * (2 * position / (len(methods) - 1) - 1)
+        shares, limits = _rates(shown_rows, outcome)
+        heights = [list(worlds).index(str(row.conditions.world)) + shift for row in shown_rows]
+        line = _marks(shares, heights, title, look_of(shown_rows[0].method), is_open=shown_rows[0].is_shipped)
+        traces.append({**line, "mode": "markers", "error_x": _errors(shares, limits)})
+    for name, shown_rows in zip(names, worlds.values(), strict=True):
+        for row in shown_rows:
+            lines.append([name, row.title, percent(row.rate(outcome)), _span(row.intervals[outcome])])
+    layout = {
+        "height": 120 + _ROW_PX * len(names),
+        "xaxis": {"title": {"text": f"{outcome}, % of the cases"}, "range": [-1, 101]},
+        "yaxis": _row_axis(names),
+    }
+    description = f"{outcome} by world and method, with 95 % intervals"
+    return Chart(f"worlds-{outcome}", description.capitalize(), lines, {"data": traces, "layout": layout})
+
+
+def _row_axis(titles: Sequence[str]) -> dict[str, Any]:
+    """Return a vertical axis with a row for each title, the first on top."""
+    return {
+        "tickvals": list(range(len(titles))),
+        "ticktext": list(titles),
+        "range": [len(titles) - 0.5, -0.5],
+        "zeroline": False,
+    }
 
 
 def _rates(rows: Sequence[Summary], outcome: str) -> tuple[list[float], list[tuple[float, float]]]:

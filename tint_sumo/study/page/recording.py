@@ -32,7 +32,7 @@ from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.jobs import label, policy_folder, policy_path
 
 EPISODES = "episodes"  # folder of the recorded episodes in a study's folder
-FORMAT = 2  # number of the files' format
+FORMAT = 3  # number of the files' format
 MISSING = -32768  # a column's number where a value is missing
 # Units that the numbers of each column are multiples of. A column holds the first number, then the differences.
 UNITS = {
@@ -47,6 +47,9 @@ UNITS = {
     "value": 0.01,
     "attention": 0.01,
     "p_conservative": 0.01,
+    "seen": 1.0,
+    "town_rank": 0.01,
+    "town_differs": 0.01,
 }
 
 Column = list[int]
@@ -77,6 +80,7 @@ class _StoredVehicle:
     brakes: tuple[int, ...]
     attention: tuple[int, ...] | None = None
     p_conservative: tuple[int, ...] | None = None
+    seen: tuple[int, ...] | None = None  # whether the ego perceives it; None where it always does
 
 
 @dataclass(frozen=True)
@@ -276,6 +280,8 @@ def _ego(moments: Sequence[Moment]) -> dict[str, Column]:
         "held": [moment.is_held for moment in moments],
         "desired_mps": [np.nan if moment.desired_mps is None else moment.desired_mps for moment in moments],
         "value": [np.nan if moment.value is None else moment.value for moment in moments],
+        "town_rank": [np.nan if moment.town is None else moment.town.rank for moment in moments],
+        "town_differs": [np.nan if moment.town is None else moment.town.differs for moment in moments],
     }
     return {name: _column(name, values) for name, values in columns.items() if not np.isnan(values).all()}
 
@@ -292,6 +298,9 @@ def _vehicle(
     }
     if present[0].attention is not None:
         columns["attention"] = [moment.attention[slot] for moment in present if moment.attention is not None]
+    seen = [bool(moment.seen[slot]) for moment in present]
+    if not all(seen):
+        columns["seen"] = seen
     if reader is not None:
         columns["p_conservative"] = reader.p_conservative(
             np.array([moment.observed_traits[slot] for moment in present if moment.observed_traits is not None])

@@ -20,14 +20,14 @@ from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import read_versions
 from tint_sumo.scenes import Scene, paper_scene, read_described, require_built_in
 from tint_sumo.study.jobs import read_curves
-from tint_sumo.study.page.charts import Chart, condition_charts, curve_chart, outcome_chart
+from tint_sumo.study.page.charts import Chart, condition_charts, curve_chart, outcome_chart, world_chart
 from tint_sumo.study.page.choosing import choose
 from tint_sumo.study.page.episodes import Recordings, failure_lists, player_data, player_notes, record_episodes
 from tint_sumo.study.page.findings import MEANING_OF_P, what_came_out
 from tint_sumo.study.page.html import chart, content_policy, folded, json_data, packed, paragraph, section, table
 from tint_sumo.study.page.latents import read_latents
 from tint_sumo.study.report import StudyReport
-from tint_sumo.study.summary import Row, at_mixes, over_all_mixes
+from tint_sumo.study.summary import Row, at_mixes, in_worlds, over_all_mixes
 from tint_sumo.study.tables import Lines, Table
 
 PAGE_FILE = "report.html"
@@ -100,6 +100,7 @@ def _page(study: _Study) -> str:
         ("results", "Results", _results(study, charts)),
         ("curves", "Learning curves", _curves(study, charts)),
         ("conditions", "Other conditions and shorter trainings", _conditions(study, charts)),
+        ("worlds", "Worlds", _worlds(study, charts)),
         ("player", "Episode player", _player(study)),
         ("failures", "Failures", _failures(study)),
         ("latents", "Latent space", _latents(study)),
@@ -180,6 +181,14 @@ def _conditions(study: _Study, charts: list[Chart]) -> str:
     return "".join(
         [*shown, *(_table(found) for found in study.tables.values() if found.heading.startswith("Other conditions"))]
     )
+
+
+def _worlds(study: _Study, charts: list[Chart]) -> str:
+    found = in_worlds(study.rows)
+    if not found:
+        return _left_out("the study tested its policies among the drivers of their training alone")
+    shown = [_shown(world_chart(found, outcome), charts) for outcome in ("success", "collision")]
+    return "".join([*shown, _table(study.tables["Worlds"])])
 
 
 def _player(study: _Study) -> str:

@@ -28,9 +28,9 @@ class Episode {
     const now = Math.min(frame, this.frames - 1);
     const pick = (columns, index) =>
       Object.fromEntries(Object.entries(columns).map(([name, values]) => [name, values[index]]));
-    const nothing = { attention: null, p_conservative: null };
+    const nothing = { attention: null, p_conservative: null, seen: 1 };
     return {
-      ego: { desired_mps: null, value: null, ...pick(this.ego, now) },
+      ego: { desired_mps: null, value: null, town_rank: null, town_differs: null, ...pick(this.ego, now) },
       claims: this.routes.filter(([, claimed]) => claimed[now]).map(([name]) => name),
       vehicles: this.vehicles
         .filter((one) => now >= one.first && now < one.first + one.columns.x_m.length)
@@ -39,6 +39,12 @@ class Episode {
     };
   }
 }
+
+// What the drivers so far say about the town, where a policy compares them.
+const townFacts = ({ town_rank: rank, town_differs: differs }) => {
+  if (rank === null) return {};
+  return { town: `gaps longer than in ${percent(rank)} % of towns, drivers differ with ${percent(differs)} %` };
+};
 
 class Pane {
   constructor(element, contents) {
@@ -96,6 +102,7 @@ class Pane {
       value: ego.value === null ? "none" : ego.value.toFixed(2),
       claims: claims.join(", ") || "no lane",
       "safety check": ego.held ? "holds the ego" : "lets it drive",
+      ...townFacts(ego),
     };
     return outcome ? { ...facts, outcome } : { ...facts, outcome: "still open" };
   }
@@ -108,8 +115,9 @@ class Pane {
       inferredWords(one.p_conservative) || "nothing",
       one.attention === null ? "none" : `${percent(one.attention)} %`,
       one.brakes ? "brakes" : "no",
+      one.seen ? "yes" : "no",
     ]);
-    const columns = ["vehicle", "true trait", "taken for", "attention", "brakes"];
+    const columns = ["vehicle", "true trait", "taken for", "attention", "brakes", "seen"];
     const head = make("tr", { class: "head" });
     head.append(...columns.map((name) => make("th", { scope: "col" }, name)));
     const rows = lines.map((line) => {

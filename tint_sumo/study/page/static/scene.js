@@ -39,7 +39,9 @@ class SceneView {
     const box = this.box(one, one.trait, one.trait[0].toUpperCase());
     box.querySelector(".body").style.fill = inferredColour(one.p_conservative);
     box.classList.toggle("hatched", one.p_conservative !== null && one.p_conservative < 0.5);
-    box.append(makeSvg("title", {}, `vehicle ${one.number}: ${one.trait}${inferredWords(one.p_conservative, ", taken for ")}`));
+    box.classList.toggle("hidden", !one.seen);
+    const words = `${inferredWords(one.p_conservative, ", taken for ")}${one.seen ? "" : ", not seen"}`;
+    box.append(makeSvg("title", {}, `vehicle ${one.number}: ${one.trait}${words}`));
     return box;
   }
 

@@ -156,6 +156,35 @@ def test_gymnasium_makes_vectors_in_every_way(mode: AutoresetMode) -> None:
         arguments: dict[str, Any] = {"autoreset_mode": mode}
         kwargs = arguments if way == "vector_entry_point" else {"vector_kwargs": arguments}
         with closing(gymnasium.make_vec(ENV_ID, 2, way, time_limit_s=0.3, **kwargs)) as env:
+            assert env.autoreset_mode is mode  # type: ignore[attr-defined]  # libraries read it
             env.reset(seed=5)
             rewards.append([env.step(np.full(2, GO))[1].tolist() for _ in range(5)])
     assert rewards[0] == rewards[1] == rewards[2]
+
+
+@pytest.mark.long  # TorchRL takes seconds to import
+def test_torchrl_sees_the_same_episodes() -> None:
+    torchrl = pytest.importorskip("torchrl.envs")
+    from torchrl.envs.utils import check_env_specs
+
+    task: dict[str, Any] = {"decision_s": 0.4, "time_limit_s": 6.0, "autoreset_mode": "Disabled"}
+    with (
+        closing(gymnasium.make_vec(ENV_ID, 3, **task)) as ours,
+        closing(torchrl.GymWrapper(gymnasium.make_vec(ENV_ID, 3, **task), categorical_action_encoding=True)) as theirs,
+    ):
+        check_env_specs(theirs)
+        theirs.set_seed(4)
+        rollout = theirs.rollout(40, break_when_any_done=False)
+        ours.reset(seed=4)  # as TorchRL does to set a seed, before it begins
+        observations, _ = ours.reset()
+        for step, actions in enumerate(rollout["action"].T.numpy()):
+            np.testing.assert_array_equal(rollout["vehicles"][:, step], observations["vehicles"])
+            observations, rewards, terminated, truncated, _ = ours.step(actions)
+            now = rollout["next"][:, step]
+            np.testing.assert_array_equal(now["vehicles"], observations["vehicles"])
+            np.testing.assert_allclose(now["reward"][:, 0], rewards, rtol=1e-6)
+            np.testing.assert_array_equal(now["terminated"][:, 0], terminated)
+            np.testing.assert_array_equal(now["truncated"][:, 0], truncated)
+            if (terminated | truncated).any():
+                observations, _ = ours.reset(options={"reset_mask": terminated | truncated})
+        assert rollout["next", "truncated"].any() and rollout["next", "terminated"].any()

@@ -91,9 +91,9 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             raise InputError("scenes of one environment must observe the same number of vehicles; change max_vehicles")
         if len({task.contents._replace(slot_infos=()) for task in settings}) > 1:
             raise InputError("scenes of one environment must have the same `perceives` and `red_light`; change them")
-        self._mode = _autoreset_mode(autoreset_mode)
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         fps = render_fps(first.decision_s)
-        self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode, "render_fps": fps}
         self.num_envs = num_envs
         self.contents = max((task.contents for task in settings), key=lambda contents: len(contents.slot_infos))
         self.render_mode = render_mode
@@ -108,8 +108,8 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def _make_batch(self) -> Batch:
         settings = self._settings
         if share_simulation(settings):
-            return LocalBatch(self.num_envs, settings, self._mode)
-        return WorkerBatch(self.num_envs, settings, self._mode)
+            return LocalBatch(self.num_envs, settings, self.autoreset_mode)
+        return WorkerBatch(self.num_envs, settings, self.autoreset_mode)
 
     @cached_property
     def batch(self) -> Batch:
@@ -148,13 +148,13 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         self._calls.require_episode()
         begun = self.batch.rows["outcome"] != GOING_ON  # those that ended before: NEXT_STEP now begins the next ones
-        if self._mode is AutoresetMode.DISABLED and begun.any():
+        if self.autoreset_mode is AutoresetMode.DISABLED and begun.any():
             raise InputError(
                 f"the episodes of environments {', '.join(map(str, np.flatnonzero(begun)))} have ended; "
                 'reset them with options={"reset_mask": mask} before the next step'
             )
         rows, ended = self.advance(actions)
-        if self._mode is AutoresetMode.SAME_STEP:
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
             begun[[end.index for end in ended]] = True
         infos = self._infos(rows)
         if not begun.all():  # an episode that begins has no rewards yet
@@ -237,7 +237,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _ending(self, ended: Ended) -> dict[str, Any]:
         """Return the entries that infos get where an episode has ended."""
-        if self._mode is not AutoresetMode.SAME_STEP:
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             return end_info(ended.outcome, ended.collision)
         last = fields_of(ended.row)
         final = step_info(last, self.contents, ended.collision)

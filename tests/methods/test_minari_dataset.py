@@ -10,10 +10,12 @@ from typing import Any
 import minari
 import numpy as np
 import pytest
+from filelock import FileLock
 from minari.dataset.minari_dataset import EpisodeData
 
 from tests.scenes.networks import UserNetwork
 from tint_sumo.core.errors import InputError
+from tint_sumo.core.files import LOCK_FILE
 from tint_sumo.core.progress import Progress
 from tint_sumo.envs import TaskSettings
 from tint_sumo.methods import minari_dataset
@@ -171,6 +173,21 @@ def test_an_interrupted_recording_leaves_nothing(tmp_path: Path, monkeypatch: py
     with pytest.raises(KeyboardInterrupt):
         record_minari(NAME, EPISODES, root=tmp_path, report=interrupt)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_process_has_left_is_removed_but_not_what_a_running_one_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = tmp_path / ".mine.a-v0.partial" / "data"
+    left.mkdir(parents=True)
+    (left / "main_data.hdf5").write_text("half")
+    one, lock = replace(EPISODES, episodes=1), FileLock(left.parent / LOCK_FILE)
+    monkeypatch.setattr(minari_dataset, "LOCK_TIMEOUT_S", 0.1)
+    with lock, pytest.raises(InputError, match="wait for it, or give another name as `minari`"):
+        record_minari("mine/a-v0", one, root=tmp_path)
+    assert (left / "main_data.hdf5").read_text() == "half"
+    record_minari("mine/a-v0", one, root=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
 def test_a_dataset_that_is_not_what_was_driven_does_not_appear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
 """Episodes of policies as datasets in the format of Minari (https://minari.farama.org), for offline learning."""
 
-import tempfile
+import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import h5py  # noqa: F401 - Minari asks for it only when it writes
 import numpy as np
+from filelock import FileLock, Timeout
 from minari import EpisodeData, MinariDataset, __version__
 from minari.data_collector.episode_buffer import EpisodeBuffer
 from minari.dataset.minari_dataset import DATASET_ID_RE
@@ -21,7 +22,7 @@ from minari.storage import get_dataset_path
 from tint_sumo import __version__ as own_version
 from tint_sumo.config import EpisodesSeed, Fraction
 from tint_sumo.core.errors import InputError, shown
-from tint_sumo.core.files import require_output_folder, write_json
+from tint_sumo.core.files import LOCK_FILE, LOCK_TIMEOUT_S, require_output_folder, write_json
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.core.provenance import PACKAGES, commit, versions
@@ -176,7 +177,8 @@ def record_minari(
         report: called with the progress.
 
     Raises:
-        InputError: the name is none, there is such a dataset already, or the folder cannot be written to.
+        InputError: the name is none, there is such a dataset already or one in the making, or the folder is no home for
+            it.
     """
     root = (get_dataset_path() if root is None else root).absolute()  # relative ones confuse Minari
     require_new_dataset(name, root)
@@ -225,21 +227,32 @@ def require_new_dataset(name: str, root: Path) -> None:
 def _whole_dataset(name: str, root: Path) -> Iterator[Path]:
     """Yield a folder for the data of a dataset, and give it its name if the block succeeds.
 
+    It is a hidden one beside the datasets, which Minari does not see. What a killed process has left there is removed.
+
     Raises:
-        FileExistsError: meanwhile there is another dataset of this name.
+        InputError: another process records a dataset of this name.
     """
-    root.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(".partial", ".minari-", root) as hidden:
-        folder = Path(hidden) / _DATA
-        folder.mkdir()
-        yield folder
-        target = root / name
+    partial, target = root / f".{name.replace('/', '.')}.partial", root / name
+    partial.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(partial / LOCK_FILE, timeout=LOCK_TIMEOUT_S)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InputError(f"another process records {target}; wait for it, or give another name as `minari`") from None
+    try:
+        data = partial / _DATA
+        shutil.rmtree(data, ignore_errors=True)
+        data.mkdir()
+        yield data
         for namespace in reversed(target.parents[: name.count("/")]):
             namespace.mkdir(exist_ok=True)
             if not (namespace / NAMESPACE_METADATA_FILENAME).exists():
                 write_json(namespace / NAMESPACE_METADATA_FILENAME, {})
         target.mkdir()
-        folder.rename(target / _DATA)
+        data.rename(target / _DATA)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        lock.release()
 
 
 def _metadata(episodes: PolicyEpisodes, given: Credits, outcomes: Counter[str]) -> dict[str, Any]:

@@ -15,7 +15,12 @@ from tint_sumo.simulation.scene import SceneSimulation
 
 
 def ceiling(p_conservative: Mix, episodes: int, case_set: int = 0, scene: Scene | None = None) -> float:
-    """Return the share of the cases in which enough yielding drivers come in time.
+    """Return the share of the cases that ``finishable`` finds, whose arguments these are."""
+    return float(finishable(p_conservative, episodes, case_set, scene).mean())
+
+
+def finishable(p_conservative: Mix, episodes: int, case_set: int = 0, scene: Scene | None = None) -> NDArray[np.bool_]:
+    """Return the cases (episodes,) in which enough yielding drivers come in time.
 
     A careful ego enters a route only before a driver that yields. It knows all traits, never brakes on its way and
     needs no room to the vehicle that passes before the yielding driver, so that no careful policy does better. One that
@@ -27,7 +32,7 @@ def ceiling(p_conservative: Mix, episodes: int, case_set: int = 0, scene: Scene 
     """
     played = scene or paper_scene()
     played = replace(played, traffic=replace(played.traffic, p_conservative=p_conservative))
-    finished = 0
+    finished: list[NDArray[np.bool_]] = []
     simulation = SceneSimulation(min(BATCH, episodes), played, with_ego=False)
     try:
         for first in range(0, episodes, simulation.replicas):
@@ -35,10 +40,10 @@ def ceiling(p_conservative: Mix, episodes: int, case_set: int = 0, scene: Scene 
             for replica in range(count):
                 rng, _ = seeding.np_random(case_seed(case_set, first + replica))
                 simulation.reset(replica, episode_seed(rng, played.population.episodes_per_town))
-            finished += int(_finishes(simulation)[:count].sum())
+            finished.append(_finishes(simulation)[:count])
     finally:
         simulation.close()
-    return finished / episodes
+    return np.concatenate(finished)
 
 
 def _finishes(simulation: SceneSimulation) -> NDArray[np.bool_]:

@@ -399,6 +399,16 @@ def test_the_table_of_relative_traits_is_that_of_the_results() -> None:
             assert cell == f"{100 * row['accuracy']:.1f} ({100 * row['calibration_error']:.1f})"
 
 
+def test_the_numbers_of_adaptation_are_those_of_the_results() -> None:
+    page = (DOCS / "explanation" / "strangers.md").read_text()
+    (words,) = re.findall(r"### Getting to know a town\n(.*?)\n## ", page, re.DOTALL)
+    told = [float(number) for number in re.findall(r"\d\d\.\d", words)]
+    measured = pandas.read_csv(RESULTS / "adaptation.csv").groupby("kind", sort=False)["accuracy"].apply(list)
+    first, _, last = measured["long"]
+    expected = [first, last, *measured["remembers"], *measured["forgets"]]
+    assert told == [round(100 * accuracy, 1) for accuracy in expected]
+
+
 def test_the_table_of_policies_among_strangers_is_that_of_the_results() -> None:
     (table,) = (one for one in _tables(DOCS / "explanation" / "strangers.md") if "`ttc`" in one)
     head, _, *lines = table.strip().split("\n")

@@ -3,7 +3,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tint_sumo.core.statistics import Hits, Rate, difference_interval, rate_interval
+from tint_sumo.core.statistics import (
+    Hits,
+    Rate,
+    difference_interval,
+    improvement,
+    improvement_interval,
+    interquartile_interval,
+    interquartile_mean,
+    rate_interval,
+)
 
 
 def hits(*rates: float, cases: int = 400, seed: int = 0) -> Hits:
@@ -90,3 +99,33 @@ def test_cases_that_are_hard_for_both_methods_do_not_blur_their_difference() -> 
     elsewhere = difference_interval(better & solvable, worse & ~solvable)
     assert width(on_the_same_cases) < 0.6 * width(elsewhere)
     assert on_the_same_cases[0] > 0.0
+
+
+def test_the_interquartile_mean_is_that_of_the_middle_half() -> None:
+    scores = np.array([[0.9, 0.0], [0.8, 0.7], [0.6, 0.5], [1.0, 0.4]])
+    assert interquartile_mean(scores) == pytest.approx((0.5 + 0.6 + 0.7 + 0.8) / 4)
+    failed = np.array([[0.9, 0.9], [0.9, 0.9], [0.9, 0.9], [0.1, 0.9]])
+    assert interquartile_mean(failed) == pytest.approx(0.9), "a training that failed changes it little"
+
+
+def test_a_draw_counts_half_of_an_improvement() -> None:
+    scores, others = np.array([[0.5], [0.7]]), np.array([[0.5], [0.6], [0.9]])
+    # Of the six pairs, the first training draws once, and the second wins twice.
+    assert improvement(scores, others) == pytest.approx((0.5 + 2) / 6)
+    assert improvement(others, scores) == pytest.approx(1.0 - (0.5 + 2) / 6)
+    two_tasks = np.concatenate([scores, scores + 1.0], axis=1)
+    assert improvement(two_tasks, np.concatenate([others, others], axis=1)) == pytest.approx(((0.5 + 2) / 6 + 1.0) / 2)
+
+
+def test_intervals_over_seeds_hold_the_value_and_shrink_with_their_number() -> None:
+    rng = np.random.default_rng(0)
+    few, many, others = rng.normal(0.7, 0.1, (3, 4)), rng.normal(0.7, 0.1, (30, 4)), rng.normal(0.6, 0.1, (5, 4))
+    for scores in (few, many):
+        low, high = interquartile_interval(scores)
+        assert low < interquartile_mean(scores) < high
+        low, high = improvement_interval(scores, others)
+        assert low <= improvement(scores, others) <= high
+    assert width(interquartile_interval(many)) < 0.6 * width(interquartile_interval(few))
+    assert width(improvement_interval(many, others)) < width(improvement_interval(few, others))
+    same = np.full((4, 3), 0.5)
+    assert interquartile_interval(same) == (0.5, 0.5) and improvement_interval(same, same) == (0.5, 0.5)

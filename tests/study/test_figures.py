@@ -15,7 +15,7 @@ from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import METHODS
 from tint_sumo.study import figures
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_worlds
+from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_profiles, plot_worlds
 from tint_sumo.study.summary import at_mixes, in_worlds, over_all_mixes, tabulate
 
 AS_TRAINED = Conditions(ALL_MIXES)
@@ -153,3 +153,12 @@ def test_worlds_have_a_line_each_and_methods_a_marker(tmp_path: Path, drawn: Cal
     for axes, shown in ((success, [[50.0] * 2, [80.0] * 3]), (collision, [[40.0] * 2, [10.0] * 3])):
         markers = [container[0].get_xdata() for container in axes.containers]  # type: ignore[union-attr]
         assert [list(x) for x in markers] == shown
+
+
+def test_profiles_fall_from_all_trainings_to_none(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    found = {"oracle": np.array([[0.9, 0.8], [0.9, 0.2]]), "no labels": np.array([[0.5, 0.5]])}
+    assert_picture(plot_profiles(found, tmp_path / "profiles.png"))
+    oracle, other = (line.get_xydata() for line in drawn().axes[0].get_lines())
+    at = {round(float(success)): share for success, share in oracle.tolist()}
+    assert [at[success] for success in (0, 30, 85, 95)] == [100.0, 75.0, 50.0, 0.0]
+    assert other[0, 1] == 100.0 and other[-1, 1] == 0.0

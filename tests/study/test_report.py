@@ -1,6 +1,7 @@
 import csv
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -8,14 +9,14 @@ from tests.study.scenes import given, trained, write_results
 from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_json, write_text
-from tint_sumo.core.statistics import Rate, difference_interval, rate_interval
+from tint_sumo.core.statistics import Rate, difference_interval, interquartile_mean, rate_interval
 from tint_sumo.methods.training import CURVE_FILE
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE
 from tint_sumo.study.report import StudyReport, result_tables, to_markdown, write_report
 from tint_sumo.study.results import Result
 from tint_sumo.study.results_csv import read_csv, to_csv
-from tint_sumo.study.summary import Row, tabulate
+from tint_sumo.study.summary import Row, scores, tabulate
 
 AS_TRAINED, NOISY, HALF = Conditions(ALL_MIXES), Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, percent=50)
 CURVE = "decisions,success,timeout,collision\n64,0.1,0.4,0.5\n128,0.6,0.1,0.3\n"
@@ -82,7 +83,13 @@ def tables(markdown: str) -> dict[str, list[list[str]]]:
 
 def test_every_file_is_written_and_nothing_else(study: Path, report: StudyReport) -> None:
     assert report.markdown_file.read_text() == report.markdown
-    assert [file.name for file in report.figure_files] == ["results.png", "conditions.png", "worlds.png", "curves.png"]
+    assert [file.name for file in report.figure_files] == [
+        "results.png",
+        "conditions.png",
+        "worlds.png",
+        "profiles.png",
+        "curves.png",
+    ]
     for file in report.figure_files:
         with Image.open(file) as figure:
             assert figure.format == "PNG" and figure.width > 500
@@ -160,9 +167,25 @@ def test_every_table_of_several_seeds_is_there(report: StudyReport) -> None:
         "All outcomes",
         "Collisions by trait and route",
         "Differences in success",
+        "Over seeds and conditions",
         "Other conditions and shorter trainings",
         "Worlds",
     ]
+
+
+def test_seeds_that_fail_are_shown_beside_the_interquartile_mean(report: StudyReport) -> None:
+    head, *lines = tables(report.markdown)["Over seeds and conditions"]
+    assert head == ["method", "seeds", "interquartile mean", "worst seed", "best seed", "beats no labels %"]
+    assert [line[0] for line in lines] == ["no labels", "paper's method", "oracle"], "the rule has no seeds"
+    by_title = scores(report.rows)
+    assert {title: found.shape for title, found in by_title.items()} == dict.fromkeys(by_title, (3, 6))
+    # Successes at P 0.25 and 0.4, as trained, with noise, and in two worlds.
+    successes = np.array([[s - 2, s, s - 1, s - 3, s, s - 5] for s in (19, 18, 19)]) / 20
+    np.testing.assert_allclose(np.sort(by_title["oracle"], axis=1), np.sort(successes, axis=1))
+    oracle = lines[2]
+    assert oracle[1] == "3" and oracle[3:5] == ["80.8", "85.8"]
+    assert oracle[2].startswith(f"{100 * interquartile_mean(successes):.1f} [")
+    assert oracle[5] == "100.0 [100.0, 100.0]" and lines[0][5] == "-"
 
 
 def test_worlds_are_rows_with_all_outcomes_of_each_method(report: StudyReport) -> None:

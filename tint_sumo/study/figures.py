@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from tint_sumo.core.files import whole_file
 from tint_sumo.core.percentages import percent
+from tint_sumo.core.statistics import Scores
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.envs.worlds import find_world
 from tint_sumo.methods.registry import METHODS, look_of
@@ -110,6 +111,24 @@ def plot_conditions(rows: Sequence[Summary], file: Path) -> Path:
     all_axes[0].set_ylabel("success, all mixes (%)")
     entries = all_axes[0].get_legend_handles_labels()
     figure.legend(*entries, loc="outside lower center", ncols=6, frameon=False, fontsize=8)
+    return _write(figure, file)
+
+
+def plot_profiles(found: Mapping[str, Scores], file: Path) -> Path:
+    """Draw performance profiles: the share of trainings and conditions in which a method succeeds more often than this.
+
+    A line that falls early shows trainings that fail (Agarwal et al. 2021). ``found`` has success (S, T) by title.
+    """
+    looks = {method.title: name for name, method in METHODS.items()}
+    figure = Figure(figsize=(7.5, 4.6), dpi=150, layout="constrained")
+    axes = figure.subplots()
+    thresholds = np.linspace(0.0, 1.0, 201)
+    for title, scores in found.items():
+        shares = (scores.flatten()[:, None] > thresholds).mean(axis=0)
+        axes.plot(100.0 * thresholds, 100.0 * shares, label=title, **_line_style(looks[title]) | {"markevery": 0.12})
+    axes.set(xlabel="success (%)", ylabel="trainings and conditions with more than that (%)")
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False, fontsize=8, ncols=2)
     return _write(figure, file)
 
 

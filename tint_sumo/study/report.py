@@ -1,17 +1,26 @@
 """A study's results as CSV, Markdown and figures, from the results of the single jobs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tint_sumo.core.files import write_text
 from tint_sumo.core.percentages import percent
-from tint_sumo.core.statistics import difference_interval
+from tint_sumo.core.statistics import (
+    Interval,
+    Scores,
+    difference_interval,
+    improvement,
+    improvement_interval,
+    interquartile_interval,
+    interquartile_mean,
+)
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.envs.worlds import find_world
+from tint_sumo.methods.registry import METHODS
 from tint_sumo.study.ceiling_job import read_ceilings
-from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_worlds
+from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_profiles, plot_worlds
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.results import read_results
 from tint_sumo.study.results_csv import Ceilings, to_csv
@@ -24,6 +33,7 @@ from tint_sumo.study.summary import (
     by_world,
     in_worlds,
     over_all_mixes,
+    scores,
     tabulate,
 )
 from tint_sumo.study.tables import Lines, Table
@@ -56,6 +66,8 @@ def write_report(out: Path) -> StudyReport:
         figures.append(plot_conditions(over_all_mixes(rows), out / "conditions.png"))
     if in_worlds(rows):
         figures.append(plot_worlds(in_worlds(rows), out / "worlds.png"))
+    if len(found := scores(rows)) > 1:
+        figures.append(plot_profiles(found, out / "profiles.png"))
     if curves := read_curves(out):
         figures.append(plot_curves(curves, out / "curves.png"))
     tables = result_tables(rows, ceilings)
@@ -80,6 +92,8 @@ def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
         tables.append(Table("Collisions by trait and route", _collision_lines(main), _COLLISION_NOTE))
     if _compared(main):
         tables.append(Table("Differences in success", _difference_lines(main), _DIFFERENCE_NOTE))
+    if len(found := scores(rows)) > 1:
+        tables.append(Table("Over seeds and conditions", _robust_lines(found), _ROBUST_NOTE))
     if varied:
         tables.append(Table("Other conditions and shorter trainings", _condition_lines(varied), _CONDITIONS_NOTE))
     if in_worlds(rows):
@@ -101,6 +115,11 @@ _COLLISION_NOTE = "Collisions in 1,000 cases by trait and route of the driver th
 _DIFFERENCE_NOTE = (
     "Difference to another method's success on the same cases, in percentage points with 95 % intervals over seeds and "
     "cases (bootstrap)."
+)
+_ROBUST_NOTE = (
+    "Success in percent over all fully trained policies and all conditions that every method was tested in: the "
+    "interquartile mean, which is the mean of the middle half, with its 95 % interval; means of the worst and of the "
+    "best seed; and the probability that a training beats one of the method without labels (Agarwal et al. 2021)."
 )
 _CONDITIONS_NOTE = (
     "Success (collision) in percent; every case has its own P(conservative) between 0.1 and 0.9. The first column is "
@@ -182,6 +201,24 @@ def _difference(row: Row | None, other: Row | None) -> str:
     return f"{100 * (row.rate('success') - other.rate('success')):+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
 
 
+def _robust_lines(found: Mapping[str, Scores]) -> Lines:
+    reference = found.get(METHODS["no_labels"].title)
+    lines = [["method", "seeds", "interquartile mean", "worst seed", "best seed", "beats no labels %"]]
+    for title, method_scores in found.items():
+        means = method_scores.mean(axis=1)
+        chance = "-"
+        if reference is not None and reference is not method_scores:
+            chance = _and_ends(improvement(method_scores, reference), improvement_interval(method_scores, reference))
+        middle = _and_ends(interquartile_mean(method_scores), interquartile_interval(method_scores))
+        lines.append([title, str(len(means)), middle, percent(float(means.min())), percent(float(means.max())), chance])
+    return lines
+
+
+def _and_ends(value: float, ends: Interval) -> str:
+    low, high = ends
+    return f"{percent(value)} [{percent(low)}, {percent(high)}]"
+
+
 def _condition_lines(rows: Sequence[Summary]) -> Lines:
     varied = list(dict.fromkeys(row.conditions for row in rows))
     lines = [["method", *(conditions.label for conditions in varied)]]
@@ -217,5 +254,4 @@ def _with_spread(row: Summary) -> str:
 
 
 def _with_interval(row: Summary, outcome: str) -> str:
-    low, high = row.intervals[outcome]
-    return f"{percent(row.rate(outcome))} [{percent(low)}, {percent(high)}]"
+    return _and_ends(row.rate(outcome), row.intervals[outcome])

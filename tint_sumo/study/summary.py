@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tint_sumo.config import WORLDS, Mix
-from tint_sumo.core.statistics import Hits, Interval, rate_interval
+from tint_sumo.core.statistics import Hits, Interval, Scores, rate_interval
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.evaluation import Evaluation
 from tint_sumo.methods.registry import METHODS, Learned
@@ -214,6 +214,20 @@ def by_title(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
 def by_world(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
     """Return the rows of each world, in the order of ``WORLDS``."""
     return {world: found for world in WORLDS if (found := [row for row in rows if row.conditions.world == world])}
+
+
+def scores(rows: Sequence[Row]) -> dict[str, Scores]:
+    """Return success (S, T) of each method with several trainings, in the conditions that all of these share.
+
+    Parts of trainings are left out. The mix of the training is part of the conditions.
+    """
+    several = [row for row in rows if len(row.seeds) > 1 and row.conditions.percent == 100]
+    by_task = {
+        title: {(row.mix, row.conditions): row.hits("success").mean(axis=1) for row in found}
+        for title, found in by_title(several).items()
+    }
+    common = [task for task in next(iter(by_task.values()), {}) if all(task in found for found in by_task.values())]
+    return {title: np.stack([found[task] for task in common], axis=1) for title, found in by_task.items() if common}
 
 
 def varied(rows: Sequence[AnyRow], name: str) -> dict[float, AnyRow]:

@@ -156,6 +156,7 @@ def _results(study: _Study, charts: list[Chart]) -> str:
         "All outcomes",
         "Collisions by trait and route",
         "Differences in success",
+        "Over seeds and conditions",
     ):
         if heading in study.tables:
             parts.append(_table(study.tables[heading]))

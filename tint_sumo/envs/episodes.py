@@ -64,10 +64,10 @@ from tint_sumo.scenes import AnyScene, Scene, SumocfgScene, find_scene, paper_sc
 from tint_sumo.scenes.buildings import corner_buildings
 from tint_sumo.scenes.geometry import NO_VEHICLE, Floats
 from tint_sumo.scenes.replay import ReplayScene
-from tint_sumo.simulation import ReplaySimulation, SumocfgSimulation, make_simulation
+from tint_sumo.simulation import ReplaySimulation, Simulation, SumocfgSimulation, make_simulation
 from tint_sumo.simulation.timing import StepPart, does
 
-PEDESTRIAN = "pedestrian"  # in place of the trait of somebody on foot
+PEDESTRIAN, ANOTHER_EGO = "pedestrian", "ego"  # in place of the trait of somebody on foot, or of another ego
 _SEED_LIMIT = 2**63
 _STEP_TOLERANCE = 1e-6  # of decision_s in steps, for numbers such as 0.3 / 0.1
 
@@ -301,12 +301,19 @@ class Episodes:
     Args:
         all_settings: settings among which the environments are shared out; they differ in their sensors alone.
         rows: (N,) written at each step; new if none are given.
+        simulation: of the episodes; a new one if none is given.
     """
 
-    def __init__(self, num_envs: int, all_settings: Sequence[TaskSettings], rows: Rows | None = None) -> None:
+    def __init__(
+        self,
+        num_envs: int,
+        all_settings: Sequence[TaskSettings],
+        rows: Rows | None = None,
+        simulation: Simulation | None = None,
+    ) -> None:
         settings = self.settings = all_settings[0]
         scene = settings.played
-        self.simulation = make_simulation(num_envs, scene, settings.backend)
+        self.simulation = simulation or make_simulation(num_envs, scene, settings.backend)
         self.rows = np.zeros(num_envs, settings.row_type) if rows is None else rows
         self._rules = TaskRules.of(scene, REWARD_PRESETS[settings.reward])
         self._scales = Scales(scene.position_scale_m, scene.ego_scale_m, scene.speed_scale_mps, scene.step_s)
@@ -370,10 +377,14 @@ class Episodes:
                 break
             before = self.rows.copy()
             any_ended |= self._step(np.where(over, 0.0, desired_mps))
-            add_up(before, self.rows)
-            if self._road is not None:
-                add_up_red_lights(before, self.rows)
+            self.add_up(before)
         return any_ended
+
+    def add_up(self, before: Rows) -> None:
+        """Add the rows (N,) of a decision's earlier steps to those of the step just made."""
+        add_up(before, self.rows)
+        if self._road is not None:
+            add_up_red_lights(before, self.rows)
 
     def _step(self, desired_mps: Floats) -> bool:
         """Simulate one step; return whether any episode has ended."""
@@ -457,7 +468,7 @@ class Episodes:
         event = self.simulation.egos.collision[index]
         if event is None or self.rows["outcome"][index] != COLLISION:
             return {}
-        trait = PEDESTRIAN if event.trait == NO_VEHICLE else self.simulation.scene.traits[event.trait]
+        trait = PEDESTRIAN if event.trait == NO_VEHICLE else (*self.simulation.scene.traits, ANOTHER_EGO)[event.trait]
         found = {"trait": trait, "route": event.route, "slot": event.slot, "ego_m": (event.ego_x_m, event.ego_y_m)}
         if isinstance(self.simulation, ReplaySimulation):
             found["replayed"] = self.simulation.is_replayed(event.slot)

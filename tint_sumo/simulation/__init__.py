@@ -6,10 +6,19 @@ from tint_sumo.scenes.scene import Scene
 from tint_sumo.scenes.sumocfg import SumocfgScene
 from tint_sumo.simulation.replay import ReplaySimulation
 from tint_sumo.simulation.scene import SceneSimulation
+from tint_sumo.simulation.shared import EgoView, SharedTraffic
 from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.simulation.sumocfg import SumocfgSimulation
 
-__all__ = ["ReplaySimulation", "SceneSimulation", "Simulation", "SumocfgSimulation", "make_simulation"]
+__all__ = [
+    "EgoView",
+    "ReplaySimulation",
+    "SceneSimulation",
+    "SharedTraffic",
+    "Simulation",
+    "SumocfgSimulation",
+    "make_simulation",
+]
 
 
 def make_simulation(replicas: int, scene: Scene | SumocfgScene, backend: Backend = "auto") -> Simulation:

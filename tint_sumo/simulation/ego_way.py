@@ -36,26 +36,28 @@ class EgoWay:
         connection: the simulation.
         edges: the ego's route.
         most_m: it drives no further in a step.
+        ego: the ego's id.
     """
 
-    def __init__(self, connection: Connection, edges: Sequence[str], most_m: float) -> None:
+    def __init__(self, connection: Connection, edges: Sequence[str], most_m: float, ego: str = EGO) -> None:
         self._connection = connection
+        self._ego = ego
         self._edges = tuple(edges)
         *_, self._end_m = lengths_m = [float(connection.lane.getLength(f"{edge}_0")) for edge in edges]
         # The route's end can be reached in a step from the edges after which so little is left.
         left_m = np.cumsum(lengths_m[::-1])[::-1] - lengths_m
         self._near_end = int(np.argmax(left_m <= most_m + _ARRIVAL_M))
-        connection.vehicle.subscribe(EGO, (constants.VAR_ROUTE_ID, constants.VAR_ROAD_ID))
-        found = connection.vehicle.getSubscriptionResults(EGO)
-        self._route_id = EGO
+        connection.vehicle.subscribe(ego, (constants.VAR_ROUTE_ID, constants.VAR_ROAD_ID))
+        found = connection.vehicle.getSubscriptionResults(ego)
+        self._route_id = ego
         self._number = 0  # of the edge that the ego has come to
         self._left_m = math.inf  # from there to the route's end
         self._is_on(found)
 
     def look(self, moved_m: float) -> Fate:
         """Return the ego's state after a step of this length; put it back on its route if it was rerouted."""
-        found = self._connection.vehicle.getSubscriptionResults(EGO)
-        if EGO in self._connection.simulation.getStartingTeleportIDList():
+        found = self._connection.vehicle.getSubscriptionResults(self._ego)
+        if self._ego in self._connection.simulation.getStartingTeleportIDList():
             return Fate.LOST
         if not found:
             return Fate.ARRIVED if moved_m >= self._left_m - _ARRIVAL_M else Fate.LOST
@@ -71,11 +73,11 @@ class EgoWay:
         vehicle = self._connection.vehicle
         if found[constants.VAR_ROUTE_ID] != self._route_id:
             try:
-                vehicle.setRoute(EGO, self._edges[self._number :])
+                vehicle.setRoute(self._ego, self._edges[self._number :])
             except SUMO_ERRORS:  # such as an edge ahead that a rerouter has closed
                 return False
-            self._route_id = vehicle.getRouteID(EGO)
+            self._route_id = vehicle.getRouteID(self._ego)
         if self._number >= self._near_end:
-            left_m = vehicle.getDrivingDistance(EGO, self._edges[-1], self._end_m)
+            left_m = vehicle.getDrivingDistance(self._ego, self._edges[-1], self._end_m)
             self._left_m = left_m if left_m >= 0.0 else math.inf
         return True

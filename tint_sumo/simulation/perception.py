@@ -28,15 +28,17 @@ class Perception:
     Args:
         scene: the scene.
         connection: the running simulation.
+        ego: the ego's id.
     """
 
-    def __init__(self, scene: SumocfgScene, connection: Connection) -> None:
+    def __init__(self, scene: SumocfgScene, connection: Connection, ego: str = EGO) -> None:
         self._connection = connection
+        self._ego = ego
         self._watches_lights = scene.red_light != "ignore" or "traffic_light" in scene.perceives
         self._watches_lane = not {"speed_limit", "lane"}.isdisjoint(scene.perceives)
         self._watches_right_of_way = "right_of_way" in scene.perceives
-        self.lights = RouteLights(connection, scene.step_s)
-        self.right_of_way = RightOfWay(connection, scene.max_vehicles)
+        self.lights = RouteLights(connection, scene.step_s, ego)
+        self.right_of_way = RightOfWay(connection, scene.max_vehicles, ego)
         self.clear()
 
     def clear(self) -> None:
@@ -59,9 +61,9 @@ class Perception:
         if self._watches_lane:
             vehicle = self._connection.vehicle
             self.lane = Lane(
-                vehicle.getLaneIndex(EGO),
-                self._connection.edge.getLaneNumber(vehicle.getRoadID(EGO)),
-                self._connection.lane.getMaxSpeed(vehicle.getLaneID(EGO)),
+                vehicle.getLaneIndex(self._ego),
+                self._connection.edge.getLaneNumber(vehicle.getRoadID(self._ego)),
+                self._connection.lane.getMaxSpeed(vehicle.getLaneID(self._ego)),
             )
 
     def end(self, *, arrived: bool) -> None:

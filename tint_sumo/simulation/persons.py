@@ -36,8 +36,9 @@ class Persons:
     velocities, and ``ids`` are their ids.
     """
 
-    def __init__(self, scene: SumocfgScene, connection: Connection) -> None:
+    def __init__(self, scene: SumocfgScene, connection: Connection, ego: str = EGO) -> None:
         self._connection = connection
+        self._ego = ego
         reach_m = max(_AROUND_M, scene.sight_m) if "pedestrians" in scene.perceives else _AROUND_M
         self._around_m = reach_m + scene.controller.desired_speeds_mps[-1] * scene.step_s
         self._pavements: dict[str, bool] = {}  # whether a lane is for pedestrians alone, and no crossing
@@ -61,9 +62,10 @@ class Persons:
         """
         if not self._subscribed:
             if self._connection.person.getIDCount():
-                self._connection.vehicle.subscribeContext(EGO, constants.CMD_GET_PERSON_VARIABLE, self._around_m, _SEEN)
+                vehicle = self._connection.vehicle
+                vehicle.subscribeContext(self._ego, constants.CMD_GET_PERSON_VARIABLE, self._around_m, _SEEN)
                 self._subscribed = True
-                return self.take_from(seen | self._connection.vehicle.getContextSubscriptionResults(EGO))
+                return self.take_from(seen | vehicle.getContextSubscriptionResults(self._ego))
             return {}
         found = {name: seen[name] for name in seen if constants.VAR_VEHICLE in seen[name]}
         for name, sight in tuple(found.items()):

@@ -36,8 +36,9 @@ class RightOfWay:
     vehicles in slots have priority over the ego there.
     """
 
-    def __init__(self, connection: Connection, slots: int) -> None:
+    def __init__(self, connection: Connection, slots: int, ego: str = EGO) -> None:
         self._connection = connection
+        self._ego = ego
         self._known: dict[tuple[str, str, str], tuple[frozenset[str], frozenset[str]]] = {}  # by lanes of the link
         self.has_priority: Bools = np.zeros(slots, bool)
         self.clear()
@@ -56,11 +57,11 @@ class RightOfWay:
             slot: slots of vehicles by their ids.
         """
         vehicle = self._connection.vehicle
-        lane = vehicle.getLaneID(EGO)
+        lane = vehicle.getLaneID(self._ego)
         if not lane.startswith(JUNCTION):
             self.crossing, self.must_yield = None, False
-            for after, _, _, _, via, state, *_ in vehicle.getNextLinks(EGO)[:1]:
-                left_m = self._connection.lane.getLength(lane) - vehicle.getLanePosition(EGO)
+            for after, _, _, _, via, state, *_ in vehicle.getNextLinks(self._ego)[:1]:
+                left_m = self._connection.lane.getLength(lane) - vehicle.getLanePosition(self._ego)
                 self.crossing = Crossing(lane, front_m + left_m, *self._foes(lane, after, via))
                 self.must_yield = state not in _FIRST
         self.has_priority[:] = False

@@ -18,18 +18,16 @@ from tint_sumo.scenes.geometry import NO_VEHICLE, Bools, Boxes, Floats, Numbers,
 from tint_sumo.scenes.roads import Roads
 from tint_sumo.scenes.scene import BUILDING, Building, View
 from tint_sumo.scenes.sumo_config import DEFAULT_VTYPE, SumoConfig, base_vtype
-from tint_sumo.scenes.sumo_run import SumocfgRun
 from tint_sumo.scenes.sumocfg import SumocfgScene, network_roads
 from tint_sumo.simulation.bodies import LONG_M, Bodies, Body, box_of
-from tint_sumo.simulation.connection import Connection, connect
+from tint_sumo.simulation.connection import Connection
 from tint_sumo.simulation.ego import Collision
 from tint_sumo.simulation.ego_way import EGO, EgoWay, Fate
 from tint_sumo.simulation.perception import Perception
 from tint_sumo.simulation.persons import Persons
-from tint_sumo.simulation.refusals import Refusals
 from tint_sumo.simulation.simulation import Simulation
 from tint_sumo.simulation.sumo import SPEED_MODE_OBEY_SETSPEED
-from tint_sumo.simulation.warm_starts import WarmStarts
+from tint_sumo.simulation.sumocfg_traffic import SumocfgTraffic
 
 _ONLY_STRATEGIC_CHANGES = 513  # lane changes: those that the route asks for, where there is room
 _SUMO_DRIVES = -1.0  # in place of a speed
@@ -76,19 +74,20 @@ class Kinds:
         return self._known[vtype]
 
     def _look_up(self, vehicle_id: str, vtype: str) -> VehicleKind:
+        if vtype.startswith(EGO):  # another ego, whose number comes after those of all vTypes
+            return self._kind(len(self._vtypes), vtype)
         label = base_vtype(vtype, self._vtypes)
         if label not in self._vtypes:
             raise InputError(
                 f"vehicle {vehicle_id!r} has vType {vtype!r}, which no vehicle or vType of {self._config.file} names; "
                 "define it in a route or additional file"
             )
+        return self._kind(self._vtypes.index(label), vtype)
+
+    def _kind(self, member: int, vtype: str) -> VehicleKind:
         types = self._connection.vehicletype
-        return VehicleKind(
-            self._vtypes.index(label),
-            (types.getLength(vtype), types.getWidth(vtype)),
-            types.getMinGap(vtype),
-            types.getTau(vtype),
-        )
+        size_m = (types.getLength(vtype), types.getWidth(vtype))
+        return VehicleKind(member, size_m, types.getMinGap(vtype), types.getTau(vtype))
 
 
 class SumocfgSimulation(Simulation):
@@ -103,28 +102,34 @@ class SumocfgSimulation(Simulation):
 
     scene: SumocfgScene
 
-    def __init__(self, replicas: int, scene: SumocfgScene, *, backend: Backend = "auto") -> None:
+    def __init__(
+        self,
+        replicas: int,
+        scene: SumocfgScene,
+        *,
+        backend: Backend = "auto",
+        traffic: SumocfgTraffic | None = None,
+        ego: str = EGO,
+    ) -> None:
         if replicas != 1:
             raise InputError(
                 f"a scene from a .sumocfg is one simulation per process, not {replicas}; set workers to num_envs"
             )
         super().__init__(replicas, scene)
         self.trait_of_member = np.arange(len(scene.vtypes))
-        self._refusals = Refusals(scene.config)
+        self._ego = ego
         self._ego_size_m = (scene.vehicle.length_m, scene.vehicle.width_m)
         self.passed_m = self.stop_line_m = np.array([np.inf])  # no way is ever left behind, and none is waited at
         self.claims = np.zeros((replicas, 1), bool)
-        with self._refusals:
-            self._run = SumocfgRun(scene.config, scene.added_types_xml)
-            self.connection = connect(self._run.options(seed=0), backend)
-        self.warm_starts = WarmStarts(scene, self.connection, self._run)
+        self._running = SumocfgTraffic(scene, backend) if traffic is None else traffic
+        self.connection, self.warm_starts = self._running.connection, self._running.warm_starts
         self._kinds = Kinds(scene.config, scene.vtypes, self.connection)
         self._bodies = Bodies(self.connection)
         self._long: dict[str, Body] = {}  # those around the ego
         self._known_vtypes = 0
         self._any_long = False
-        self.persons = Persons(scene, self.connection)
-        self.perception = Perception(scene, self.connection)
+        self.persons = Persons(scene, self.connection, ego)
+        self.perception = Perception(scene, self.connection, ego)
         self._step_s = scene.step_s  # which is looked up in the configuration
         self._drives = False
         self._accel_mps2 = 0.0  # of the ego, where SUMO drives it
@@ -140,8 +145,7 @@ class SumocfgSimulation(Simulation):
         return View(-across_m, -up_m, across_m, up_m).moved(float(ego["x_m"]), float(ego["y_m"]))
 
     def close(self) -> None:
-        super().close()
-        self._run.close()
+        self._running.close()
 
     # Episodes
 
@@ -152,17 +156,22 @@ class SumocfgSimulation(Simulation):
             InputError: SUMO refuses the configuration, or other vehicles leave the ego no room at its start.
         """
         self.clear(replica)
-        with self._refusals:
+        with self._running.refusals:
             self.warm_starts.begin(seed)
             self._define_ego()
             self._let_ego_enter()
+        self._start()
+
+    def _start(self) -> None:
+        """Take over where the ego is that has entered, and what is around it."""
+        with self._running.refusals:
             self._look_as_far_as_needed()
-            fastest_mps = self.connection.vehicle.getMaxSpeed(EGO)
-            self._way = EgoWay(self.connection, self.scene.departure[0], fastest_mps * self._step_s)
+            most_m = self.connection.vehicle.getMaxSpeed(self._ego) * self._step_s
+            self._way = EgoWay(self.connection, self.scene.departure[0], most_m, self._ego)
             seen = self._seen()
-        if EGO not in seen:
+        if self._ego not in seen:
             raise self._taken_at_start()
-        sight = seen[EGO]
+        sight = seen[self._ego]
         self._drives = True
         x_m, y_m, *_ = box_of(sight, self._ego_size_m, (0.0, 0.0))
         self.origin_m = (x_m, y_m)
@@ -190,52 +199,68 @@ class SumocfgSimulation(Simulation):
 
     def _define_ego(self) -> None:
         types, scene = self.connection.vehicletype, self.scene
-        types.copy(DEFAULT_VTYPE, EGO)
-        types.setVehicleClass(EGO, "passenger")
-        types.setLength(EGO, scene.vehicle.length_m)
-        types.setWidth(EGO, scene.vehicle.width_m)
-        types.setMinGap(EGO, 0.0)
-        types.setMaxSpeed(EGO, max(scene.controller.desired_speeds_mps) + 1.0)
-        types.setSpeedDeviation(EGO, 0.0)
-        types.setParameter(EGO, _REROUTING, "false")
-        self.connection.route.add(EGO, list(scene.departure[0]))
+        types.copy(DEFAULT_VTYPE, self._ego)
+        types.setVehicleClass(self._ego, "passenger")
+        types.setLength(self._ego, scene.vehicle.length_m)
+        types.setWidth(self._ego, scene.vehicle.width_m)
+        types.setMinGap(self._ego, 0.0)
+        types.setMaxSpeed(self._ego, max(scene.controller.desired_speeds_mps) + 1.0)
+        types.setSpeedDeviation(self._ego, 0.0)
+        types.setParameter(self._ego, _REROUTING, "false")
+        self.connection.route.add(self._ego, list(scene.departure[0]))
 
     def _let_ego_enter(self) -> None:
         """Insert the ego once all vehicles near its start could brake in time."""
-        vehicle, scene = self.connection.vehicle, self.scene
-        _, lane_pos_m = scene.departure
-        vehicle.add(EGO, EGO, typeID=EGO, departLane="best", departPos=str(lane_pos_m), departSpeed="0")
-        for _ in range(math.ceil(_ENTRY_PATIENCE_S / scene.step_s)):
+        self._ask_for_room()
+        for _ in range(self.patience):
             self.connection.step()
-            if EGO in self.connection.simulation.getArrivedIDList():
-                raise self._taken_at_start()
-            if EGO in self.connection.simulation.getDepartedIDList():
-                if scene.ego_control == "sumo":
+            if self._has_entered():
+                if self.scene.ego_control == "sumo":
                     self._hand_over_ego()
                 else:
                     self._hold_ego()
                 return
-        raise InputError(
-            f"the ego found no room at its start ({scene.start_m:g} m) for {_ENTRY_PATIENCE_S:g} s: vehicles stand or "
-            "enter there, or a vaporizer lets none in; choose another start_m or warm_up_s"
+        raise self.no_room()
+
+    def _ask_for_room(self) -> None:
+        """Let SUMO insert the ego as soon as there is room."""
+        ego, (_, lane_pos_m) = self._ego, self.scene.departure
+        self.connection.vehicle.add(ego, ego, typeID=ego, departLane="best", departPos=str(lane_pos_m), departSpeed="0")
+
+    @property
+    def patience(self) -> int:
+        """Steps for which the ego waits for room."""
+        return math.ceil(_ENTRY_PATIENCE_S / self.scene.step_s)
+
+    def _has_entered(self) -> bool:
+        """Return whether SUMO has inserted the ego in the last step."""
+        if self._ego in self.connection.simulation.getArrivedIDList():
+            raise self._taken_at_start()
+        return self._ego in self.connection.simulation.getDepartedIDList()
+
+    def no_room(self) -> InputError:
+        """Return the error of an ego that has waited for room in vain."""
+        return InputError(
+            f"the ego found no room at its start ({self.scene.start_m:g} m) for {_ENTRY_PATIENCE_S:g} s: vehicles "
+            "stand or enter there, or a vaporizer lets none in; choose another start_m or warm_up_s"
         )
 
     def _hold_ego(self) -> None:
         """Let the ego stand until it is given a speed."""
         vehicle = self.connection.vehicle
-        vehicle.setSpeedMode(EGO, SPEED_MODE_OBEY_SETSPEED)
-        vehicle.setLaneChangeMode(EGO, _ONLY_STRATEGIC_CHANGES)
-        vehicle.setSpeed(EGO, 0.0)
+        vehicle.setSpeedMode(self._ego, SPEED_MODE_OBEY_SETSPEED)
+        vehicle.setLaneChangeMode(self._ego, _ONLY_STRATEGIC_CHANGES)
+        vehicle.setSpeed(self._ego, 0.0)
 
     def _hand_over_ego(self) -> None:
         """Let SUMO's driver of a default passenger car drive the ego, which has entered as in all other episodes."""
         types, vehicle = self.connection.vehicletype, self.connection.vehicle
-        types.setMinGap(EGO, types.getMinGap(DEFAULT_VTYPE))
-        types.setMaxSpeed(EGO, max(self.scene.controller.desired_speeds_mps))
-        vehicle.setSpeedMode(EGO, _SUMO_SPEED_MODE)
-        vehicle.setLaneChangeMode(EGO, _SUMO_LANE_CHANGE_MODE)
-        vehicle.setSpeed(EGO, _SUMO_DRIVES)
-        self._accel_mps2 = float(types.getAccel(EGO))
+        types.setMinGap(self._ego, types.getMinGap(DEFAULT_VTYPE))
+        types.setMaxSpeed(self._ego, max(self.scene.controller.desired_speeds_mps))
+        vehicle.setSpeedMode(self._ego, _SUMO_SPEED_MODE)
+        vehicle.setLaneChangeMode(self._ego, _SUMO_LANE_CHANGE_MODE)
+        vehicle.setSpeed(self._ego, _SUMO_DRIVES)
+        self._accel_mps2 = float(types.getAccel(self._ego))
 
     def _taken_at_start(self) -> InputError:
         return InputError(
@@ -254,9 +279,14 @@ class SumocfgSimulation(Simulation):
         if not self._drives:
             self.perception.end(arrived=False)
             return
-        with self._refusals:
+        with self._running.refusals:
             moved_m = self._drive(desired_speed_mps) * self._step_s
             self._simulate()
+        self._take_over(moved_m)
+
+    def _take_over(self, moved_m: float) -> None:
+        """Take over from SUMO what has come of a step in which the ego has moved by so much, or at most so much."""
+        with self._running.refusals:
             fate = self._way.look(moved_m)
         if fate is Fate.DRIVES:
             self._look()
@@ -274,7 +304,7 @@ class SumocfgSimulation(Simulation):
             return float(self.egos.speed_mps[0]) + self._accel_mps2 * self._step_s
         self.egos.drive(desired_speed_mps)
         speed_mps = float(self.egos.speed_mps[0])
-        self.connection.vehicle.setSpeed(EGO, speed_mps)
+        self.connection.vehicle.setSpeed(self._ego, speed_mps)
         return speed_mps
 
     def _end(self, fate: Fate) -> None:
@@ -291,7 +321,7 @@ class SumocfgSimulation(Simulation):
         if self.connection.vehicletype.getIDCount() > self._known_vtypes:
             self._look_as_far_as_needed()  # from the next step on
         seen = self._seen()
-        ego = seen.pop(EGO)
+        ego = seen.pop(self._ego)
         self.egos.front_m[0] = self.scene.start_m + ego[constants.VAR_DISTANCE]
         self.egos.speed_mps[0] = ego[constants.VAR_SPEED]
         self.egos.box[0] = box_of(ego, self._ego_size_m, self.origin_m)
@@ -303,7 +333,7 @@ class SumocfgSimulation(Simulation):
 
     def _seen(self) -> dict[str, Sight]:
         """Return the ego and what is around it, by their ids."""
-        return dict(self.connection.vehicle.getContextSubscriptionResults(EGO))
+        return dict(self.connection.vehicle.getContextSubscriptionResults(self._ego))
 
     def _look_around(self) -> None:
         super()._look_around()
@@ -332,7 +362,7 @@ class SumocfgSimulation(Simulation):
         longest_m = max(lengths_m, default=0.0)
         self._any_long = longest_m > LONG_M
         reach_m = self.scene.sight_m + (longest_m if self._any_long else 0.0)
-        self.connection.vehicle.subscribeContext(EGO, constants.CMD_GET_VEHICLE_VARIABLE, reach_m, _SEEN)
+        self.connection.vehicle.subscribeContext(self._ego, constants.CMD_GET_VEHICLE_VARIABLE, reach_m, _SEEN)
 
     def _in_sight(self, seen: Mapping[str, Sight], front_m: tuple[float, float, float]) -> dict[str, Sight]:
         """Return the vehicles that are on the ego's level, not parked beside the road, and in sight."""

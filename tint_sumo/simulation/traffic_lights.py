@@ -36,8 +36,9 @@ class RouteLights:
     has driven over in the last step while their signal was red.
     """
 
-    def __init__(self, connection: Connection, step_s: float) -> None:
+    def __init__(self, connection: Connection, step_s: float, ego: str = EGO) -> None:
         self._connection = connection
+        self._ego = ego
         self._step_s = step_s
         self.clear()
 
@@ -52,7 +53,7 @@ class RouteLights:
         self.time_s = self._connection.simulation.getTime()
         known = {(light.name, light.index): light for light in self.ahead}
         ahead = []
-        for name, index, distance_m, state in self._connection.vehicle.getNextTLS(EGO):
+        for name, index, distance_m, state in self._connection.vehicle.getNextTLS(self._ego):
             since_s = self._since_s(known.get((name, index)), name, index, state)
             ahead.append(TrafficLight(name, index, front_m + distance_m, state, since_s))
         self.passed_red = self._count_red(front_m, ahead)

@@ -25,9 +25,11 @@ WRITING = {
     "traits relative": "traits relative --out OUT",
     "traits plot": "traits plot --data DATA --model vae --out OUT",
     "traits infer": "traits infer --fcd DATA --model vae --out OUT",
+    "traits export": "traits export --model vae --out OUT",
     "traits study": "traits study --out OUT",
     "policy train": "policy train --method oracle --out OUT",
     "policy record": "policy record --model ttc --episodes 1 --minari ttc-v0 --out OUT",
+    "policy export": "policy export --model no_labels --out OUT",
     "policy sweep": "policy sweep --set n_epochs=1 --out OUT",
     "render": "render --model ttc --out OUT",
     "study run": "study run --out OUT",
@@ -76,7 +78,9 @@ def test_a_run_is_not_written_into_by_others(name: str, run: Path, capsys: pytes
         "drivers export",
         "traits plot",
         "traits infer",
+        "traits export",
         "policy record",
+        "policy export",
         "render",
     ):  # others have homes of their own
         outs += [run / "new.png", run / "new.csv", run / "new.gif", run / "new"]

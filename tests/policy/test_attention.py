@@ -3,7 +3,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tint_sumo.policy.attention import Layers, Packing, attend, linear_layers
+from tint_sumo.policy.attention import AllSlots, Layers, Packing, attend, linear_layers
 from tint_sumo.traits.encoder import perceptron
 
 STREETS, SLOTS, FEATURES = 9, 5, 4
@@ -86,3 +86,16 @@ def test_padding_has_no_influence(mask: Tensor, vehicles: Tensor) -> None:
         torch.testing.assert_close(one, other)
     values = functional.pad(torch.ones(len(tight.rows), 2), (0, 0, 0, len(padded.rows) - len(tight.rows)), value=7.0)
     torch.testing.assert_close(padded.sums(values), mask.sum(1, keepdim=True).expand(-1, 2).float())
+
+
+@pytest.mark.parametrize("score_sizes", [(8,), (8, 9, 7), ()])
+def test_all_slots_as_rows_give_the_same_whatever_is_in_empty_ones(
+    mask: Tensor, vehicles: Tensor, score_sizes: tuple[int, ...]
+) -> None:
+    embed, score = networks(score_sizes)
+    layers = linear_layers(embed), linear_layers(score)
+    packing, slots = Packing.of(mask), AllSlots.of(mask)
+    garbage = torch.where(mask.unsqueeze(-1) > 0.5, vehicles, torch.nan)
+    expected = attend(packing, packing.pack(vehicles), *layers)
+    for one, other in zip(attend(slots, slots.pack(garbage), *layers), expected, strict=True):
+        torch.testing.assert_close(one, other)

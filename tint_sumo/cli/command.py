@@ -110,3 +110,14 @@ def use_one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
+
+
+@contextmanager
+def exporting_onnx() -> Iterator[None]:
+    """Say, in the block, which extra to install where a package for ONNX is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name not in ("onnx", "onnxscript"):
+            raise
+        raise InputError('--onnx needs onnx and onnxscript; install them: pip install "tint_sumo[onnx]"') from None

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import arg, subcommand
 
-from tint_sumo.cli.command import RESUMES, Outcome, SpreadCommand, use_one_thread, wrote
+from tint_sumo.cli.command import RESUMES, Outcome, SpreadCommand, exporting_onnx, use_one_thread, wrote
 from tint_sumo.cli.own_network import NetworkCommand
 from tint_sumo.cli.values import (
     PPO_BUDGET,
@@ -15,6 +15,7 @@ from tint_sumo.cli.values import (
     FolderOrUrl,
     Gpus,
     MixFlag,
+    OnnxFlag,
     PolicyName,
     PpoBudgetValue,
     Scene,
@@ -248,6 +249,27 @@ class RecordPolicy(NetworkCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExportPolicy(NetworkCommand):
+    """Write a folder with all that belongs to one learned policy, to share it or to run it without Python."""
+
+    model: PolicyName
+    out: Path
+    """Folder to write, which has no files yet; it is a model for all commands."""
+    scene: TestScene = None
+    onnx: OnnxFlag = False
+
+    def run(self) -> Outcome:
+        from tint_sumo.methods.exporting import export_policy
+        from tint_sumo.methods.loading import load_policy
+
+        use_one_thread()
+        contender = load_policy(self.model, scene=self.scene_of(self.scene))
+        with exporting_onnx():
+            files = [str(file) for file in export_policy(contender, self.out, with_onnx=self.onnx)]
+        return Outcome("\n".join(wrote(files)), {"model": self.model, "files": files})
+
+
+@dataclass(frozen=True, kw_only=True)
 class SweepPolicy(SpreadCommand):
     """Train and test methods with all combinations of some settings of PPO; the same command resumes it."""
 
@@ -298,6 +320,7 @@ class Policy:
         Annotated[TrainPolicy, subcommand("train")]
         | Annotated[EvaluatePolicy, subcommand("evaluate")]
         | Annotated[RecordPolicy, subcommand("record")]
+        | Annotated[ExportPolicy, subcommand("export")]
         | Annotated[SweepPolicy, subcommand("sweep")]
     )
 

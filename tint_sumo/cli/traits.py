@@ -7,13 +7,23 @@ from typing import Annotated, ClassVar
 
 from tyro.conf import arg, subcommand
 
-from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, names_in, use_one_thread, wrote
+from tint_sumo.cli.command import (
+    RESUMES,
+    Command,
+    Outcome,
+    SpreadCommand,
+    exporting_onnx,
+    names_in,
+    use_one_thread,
+    wrote,
+)
 from tint_sumo.cli.tracks import TrackFormatName
 from tint_sumo.cli.values import (
     SCENES,
     TRAIT_BUDGET,
     TRAIT_STUDY,
     FolderOrUrl,
+    OnnxFlag,
     SceneValue,
     TestData,
     TraitBudgetValue,
@@ -267,6 +277,24 @@ class InferTraits(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExportTraits(Command):
+    """Write a folder with all that belongs to one trait model, to share it or to run it without Python."""
+
+    model: TraitModelName
+    out: Path
+    """Folder to write, which has no files yet; it is a trait model for all commands."""
+    onnx: OnnxFlag = False
+
+    def run(self) -> Outcome:
+        from tint_sumo.methods.exporting import export_traits
+
+        use_one_thread()
+        with exporting_onnx():
+            files = [str(file) for file in export_traits(self.model, self.out, with_onnx=self.onnx)]
+        return Outcome("\n".join(wrote(files)), {"model": self.model, "files": files})
+
+
+@dataclass(frozen=True, kw_only=True)
 class IdentifyTraits(Command):
     """Measure on recorded drivers, without labels, how far traits predict, identify drivers and stay the same."""
 
@@ -326,6 +354,7 @@ class Traits:
         | Annotated[EvaluateTraits, subcommand("evaluate")]
         | Annotated[PlotTraits, subcommand("plot")]
         | Annotated[InferTraits, subcommand("infer")]
+        | Annotated[ExportTraits, subcommand("export")]
         | Annotated[IdentifyTraits, subcommand("identify")]
         | Annotated[StudyTraits, subcommand("study")]
     )

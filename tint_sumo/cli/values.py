@@ -108,6 +108,9 @@ Gpus = Annotated[float, Range(0.0, 64.0), arg(help="Share of a GPU for each trai
 TraitModelName = Annotated[
     str, arg(help="Trait model: name of a shipped one, folder of a training, or path of a .safetensors file.")
 ]
+OnnxFlag = Annotated[
+    bool, arg(help="Write ONNX files, too, which run without Python and this package; needs tint_sumo[onnx].")
+]
 TestData = Annotated[
     Path, arg(help="Folder of a dataset; its test episodes are those that training with the model's seed leaves out.")
 ]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
@@ -54,6 +55,27 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside ``folder``; rename it to ``folder`` only if the block succeeds.
+
+    Raises:
+        InputError: ``folder`` has files already, cannot be a folder, or lies in the folder of a run.
+        OSError: the system refuses to write there.
+    """
+    folder = folder.resolve()
+    require_output_folder(folder)
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder} already holds other files; choose another `out` or an empty folder")
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        partial.replace(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def is_temporary(path: PurePath) -> bool:

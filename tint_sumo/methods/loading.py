@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -194,11 +194,16 @@ def _require_finite(stem: Path, policy: GruPolicy) -> None:
 
 def _load_encoder(stem: Path, card: dict[str, Any]) -> TraitModel:
     """Return the trait model of the policy's training: the file beside it in a run, or a shipped model by its name."""
-    named = card["traits"]
-    encoder = traits.load(weights_file(stem.with_name(TRAITS)) if named == TRAITS else named, latent_size=LATENT_SIZE)
+    encoder = traits.load(trait_model_of(stem, card), latent_size=LATENT_SIZE)
     if digest(encoder) != card.get("traits_sha256"):
         raise InputError(f"{card_file(stem)} belongs to another trait model {card['traits']}; restore that model")
     return encoder
+
+
+def trait_model_of(stem: Path, card: Mapping[str, Any]) -> str | Path:
+    """Return name or path of the trait model that the card of a policy names."""
+    named: str = card["traits"]
+    return weights_file(stem.with_name(TRAITS)) if named == TRAITS else named
 
 
 def find_policy(name_or_path: str | Path) -> Path:

@@ -58,6 +58,35 @@ class Packing:
         """Return 1 divided by the number of each street's vehicles (B, 1), by 1 without any."""
         return self.real.sum(-1, keepdim=True).clamp(min=1).to(dtype).reciprocal()
 
+    def dense(self, scores: Tensor) -> Tensor:
+        """Return scores (R,) by slot (B, V), in float32 at least, and far below all others in empty slots."""
+        dtype = torch.promote_types(scores.dtype, torch.float32)
+        dense = scores.new_full(self.real.shape, _FAR_BELOW, dtype=dtype)
+        dense.view(-1).index_copy_(0, self.slots, scores[: len(self.slots)].to(dtype))
+        return dense
+
+
+class AllSlots(Packing):
+    """All slots of B streets as rows, empty ones too, for files of networks: shapes do not depend on the mask."""
+
+    @classmethod
+    def of(cls, mask: Tensor) -> "AllSlots":
+        none = mask.new_empty(0, dtype=torch.int64)
+        return cls(none, none, none, mask > 0.5)
+
+    def pack(self, values: Tensor) -> Tensor:
+        return torch.where(self.real.unsqueeze(-1), values, 0.0).flatten(0, 1)
+
+    def spread(self, values: Tensor) -> Tensor:
+        return values.unsqueeze(1).expand(-1, self.real.shape[1], -1).flatten(0, 1)
+
+    def sums(self, values: Tensor, weights: Tensor | None = None) -> Tensor:
+        weights = self.real.flatten().to(values.dtype) if weights is None else weights
+        return (values * weights.unsqueeze(-1)).reshape(*self.real.shape, -1).sum(1)
+
+    def dense(self, scores: Tensor) -> Tensor:
+        return torch.where(self.real, scores.reshape(self.real.shape), _FAR_BELOW)
+
 
 Layers = list[tuple[Tensor, Tensor]]  # weight (outputs, inputs) and bias (outputs,) of linear layers
 
@@ -107,12 +136,8 @@ class _Attention(torch.autograd.Function):
             first = packing.spread(shared).addmm_(embedded, weight[:, :size].t()).relu_()
             hidden = _rectified(first, further[:-1])
             last_weight, last_bias = further[-1]
-            scores = torch.addmv(last_bias, hidden[-1], last_weight[0])[: len(packing.slots)]
-            dense = scores.new_full(
-                packing.real.shape, _FAR_BELOW, dtype=torch.promote_types(scores.dtype, torch.float32)
-            )
-            dense.view(-1).index_copy_(0, packing.slots, scores.to(dense.dtype))
-            weights = torch.softmax(dense, dim=-1).mul_(packing.real)
+            scores = torch.addmv(last_bias, hidden[-1], last_weight[0])
+            weights = torch.softmax(packing.dense(scores), dim=-1).mul_(packing.real)
         else:
             mean, hidden = embedded[:0], []
             weights = packing.real * packing.shares(torch.promote_types(inputs.dtype, torch.float32))

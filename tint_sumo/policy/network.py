@@ -51,6 +51,8 @@ class AttentionExtractor(BaseFeaturesExtractor):
         InputError: the observation space lacks one of these.
     """
 
+    packing: type[Packing] = Packing  # AllSlots for a network that is written as a file
+
     def __init__(self, observation_space: spaces.Dict, settings: PolicySettings | None = None) -> None:
         settings = settings or PolicySettings()
         super().__init__(observation_space, features_dim=settings.joint_sizes[-1])
@@ -100,7 +102,7 @@ class AttentionExtractor(BaseFeaturesExtractor):
 
     def _attend(self, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return the sums (B, embedded) of a batch's weighted embeddings, and the weights (B, V)."""
-        packing = Packing.of(observations["mask"])
+        packing = self.packing.of(observations["mask"])
         parts = [
             packing.pack(observations["vehicles"]) * self.position_gain,
             packing.pack(observations["traits"]),
@@ -297,9 +299,13 @@ class GruPolicy(ActorCriticPolicy):
     ) -> tuple[Distribution, Tensor]:
         """Return the action distribution and new states of N observations; arguments as in ``forward``."""
         with self._autocast():
-            outputs, states = self._run(obs, states, episode_starts.unsqueeze(0))
-            latent = self.mlp_extractor.forward_actor(outputs)
+            latent, states = self.latent_actor(obs, states, episode_starts)
         return self._finite_distribution(latent), states
+
+    def latent_actor(self, obs: PyTorchObs, states: Tensor, episode_starts: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the actor's last hidden layer and new states of N observations; arguments as in ``forward``."""
+        outputs, states = self._run(obs, states, episode_starts.unsqueeze(0))
+        return self.mlp_extractor.forward_actor(outputs), states
 
     def _finite_distribution(self, latent_actor: Tensor) -> Distribution:
         """Return the distribution of actions from the actor's last hidden layer.

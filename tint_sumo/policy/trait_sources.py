@@ -22,10 +22,10 @@ from tint_sumo.traits.classifier import Classifier
 from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.model import TraitModel
 from tint_sumo.traits.relative import LATENTS, RelativeStream, TownEstimate
+from tint_sumo.traits.stepping import AGE_SCALE_S
 from tint_sumo.traits.streaming import TrackStream
 
 Observation = dict[str, np.ndarray]
-_AGE_SCALE_S = 10.0  # a vehicle crosses the street in 15 to 20 s
 _MOTION = 3  # numbers
 _SPEED_STEPS, _MEAN_STEPS = 3, 12  # of moving averages
 _GAP_SCALE_M = 10.0
@@ -246,7 +246,7 @@ class StreamingTraits(TraitSource):
         gap_m = frame.slots["gap_m"][envs]
         self._stream.forget(tracks[~present])
         mean, std = self._stream.advance(tracks[present], position_m[present], gap_m[present])
-        age = self._stream.steps[tracks[present]] * np.float32(STEP_S / _AGE_SCALE_S)
+        age = self._stream.steps[tracks[present]] * np.float32(STEP_S / AGE_SCALE_S)
         self.traits[envs] = 0.0
         rows, slots = np.nonzero(present)
         self.traits[envs[rows], slots] = np.concatenate([mean, std, age[:, None]], axis=-1)

@@ -80,10 +80,14 @@ class TraitModel(nn.Module, ABC):
             self.feature_mean[feature] = moments.mean
             self.feature_scale[feature] = (moments.std if moments.std >= SMALLEST_STD else 1.0) / spread
 
+    def scaled(self, raw: Tensor) -> Tensor:
+        """Return features (..., F), centred and scaled."""
+        gain = 1.0 / self.feature_scale
+        return torch.addcmul(-self.feature_mean * gain, raw, gain)
+
     def features(self, states: Tensor, length: Tensor) -> Tensor:
         """Return scaled features (N, T, F), zero after ``length`` and where they are unknown."""
-        gain = 1.0 / self.feature_scale
-        scaled = torch.addcmul(-self.feature_mean * gain, self.raw_features(states), gain)
+        scaled = self.scaled(self.raw_features(states))
         features = torch.where(valid_steps(states, length).unsqueeze(-1), scaled, 0.0)
         for feature, steps in enumerate(self.undefined_steps):
             features[:, :steps, feature] = 0.0

@@ -5,7 +5,7 @@ N(0, 1) counted once. In terms of evidence, which is the precision beyond the pr
 products are sums.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -27,9 +27,15 @@ def evidence(mean: Tensor, log_var: Tensor) -> Tensor:
 
 def posterior(total: Tensor) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return mean and standard deviation, each (..., latent_size), from a sum of evidence; of none, the prior's."""
-    beyond_prior, weighted = total
+    mean, std = gaussian(total)
+    return mean.numpy(), std.numpy()
+
+
+def gaussian(total: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation, as ``posterior`` does."""
+    beyond_prior, weighted = total.unbind()
     precision = 1.0 + beyond_prior
-    return (weighted / precision).numpy(), precision.rsqrt().numpy()
+    return weighted / precision, precision.rsqrt()
 
 
 def fuse_so_far(latents: Latents, vehicle: NDArray[np.integer]) -> Latents:
@@ -38,6 +44,34 @@ def fuse_so_far(latents: Latents, vehicle: NDArray[np.integer]) -> Latents:
     rows = pd.DataFrame(found.swapaxes(0, 1).flatten(1).numpy())
     total = torch.from_numpy(rows.groupby(vehicle).cumsum().to_numpy(copy=True))
     return Latents(*posterior(total.view(len(total), 2, -1).swapaxes(0, 1)))
+
+
+class TrackState(NamedTuple):
+    """All that the posteriors of K tracks need of the steps before; zeros at the start of a track."""
+
+    hidden: Tensor  # (K, hidden_size)
+    window_steps: Tensor  # (K,) int64, steps so far in the present window
+    along_m: Tensor  # (K,)
+    complete: Tensor  # (2, K, latent_size), evidence in complete windows
+
+
+def advance(model: CrossWindow, before: TrackState, along_m: Tensor, gap_m: Tensor) -> tuple[TrackState, Tensor]:
+    """Take one step of K tracks, each with its position along the lane and its gap, capped; both (K,).
+
+    Returns:
+        The state for the next step, and the evidence so far (2, K, latent_size).
+    """
+    begins = before.window_steps == 0
+    displacement = torch.where(begins, 0.0, along_m - before.along_m)
+    features = (torch.stack([displacement, gap_m], dim=-1) - model.feature_mean) / model.feature_scale
+    features = torch.stack([features[:, 0].masked_fill(begins, 0.0), features[:, 1]], dim=-1)
+    hidden = model.encoder.step(features, before.hidden.masked_fill(begins.unsqueeze(-1), 0.0))
+    window_steps = before.window_steps + 1
+    counts, complete = window_steps >= MIN_WINDOW_STEPS, window_steps == WINDOW_STEPS
+    window = evidence(*model.encoder.heads(hidden)).masked_fill(~counts.unsqueeze(-1), 0.0)
+    so_far = before.complete + window
+    after = torch.where(complete.unsqueeze(-1), so_far, before.complete)
+    return TrackState(hidden, window_steps.masked_fill(complete, 0), along_m, after), so_far
 
 
 class TrackStream:
@@ -92,22 +126,12 @@ class TrackStream:
         Returns:
             Mean and standard deviation of their latents, each (K, latent_size).
         """
-        index, along = torch.from_numpy(tracks), torch.from_numpy(along_m)
-        begins = self._window_steps[index] == 0
-        displacement = torch.where(begins, 0.0, along - self._along_m[index])
-        raw = torch.stack(
-            [displacement, torch.from_numpy(capped(gap_m, self._model.no_leader_gap_m).astype(np.float32))], dim=-1
+        index, gap = torch.from_numpy(tracks), capped(gap_m, self._model.no_leader_gap_m).astype(np.float32)
+        before = TrackState(
+            self._hidden[index], self._window_steps[index], self._along_m[index], self._complete[:, index]
         )
-        features = (raw - self._model.feature_mean) / self._model.feature_scale
-        features[:, 0].masked_fill_(begins, 0.0)
-        hidden = self._model.encoder.step(features, self._hidden[index].masked_fill_(begins.unsqueeze(-1), 0.0))
-        window_steps = self._window_steps[index] + 1
-        counts, complete = window_steps >= MIN_WINDOW_STEPS, window_steps == WINDOW_STEPS
-        self._hidden[index], self._along_m[index] = hidden, along
-        self._window_steps[index] = window_steps.masked_fill(complete, 0)
+        after, so_far = advance(self._model, before, torch.from_numpy(along_m), torch.from_numpy(gap))
+        self._hidden[index], self._window_steps[index], self._along_m[index] = after[:3]
+        self._complete[:, index] = after.complete
         self.steps[tracks] += 1.0
-
-        window = evidence(*self._model.encoder.heads(hidden)).masked_fill_(~counts.unsqueeze(-1), 0.0)
-        so_far = self._complete[:, index] + window
-        self._complete[:, index] = torch.where(complete.unsqueeze(-1), so_far, self._complete[:, index])
         return posterior(so_far)

@@ -5,12 +5,15 @@ from pathlib import Path
 
 from tint_sumo import traits
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.files import whole_folder, write_json
+from tint_sumo.core.files import whole_folder, write_json, write_text
 from tint_sumo.methods.loading import Contender, find_policy, trait_model_of
+from tint_sumo.methods.model_cards import policy_page, traits_page
 from tint_sumo.methods.training import POLICY, TRAITS
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.traits.cross_window import CrossWindow
-from tint_sumo.traits.storage import RUN_MODEL, find
+from tint_sumo.traits.storage import RUN_MODEL, find, read_card
+
+PAGE = "README.md"  # the card as Hugging Face shows it
 
 
 def export_policy(contender: Contender, out: Path, *, with_onnx: bool = False) -> list[Path]:
@@ -35,6 +38,7 @@ def export_policy(contender: Contender, out: Path, *, with_onnx: bool = False) -
             _copy(find(trait_model_of(stem, card)), folder / TRAITS)
             card["traits"] = TRAITS
         write_json(card_file(folder / POLICY), card)
+        write_text(folder / PAGE, policy_page(Path(contender.name).name, card))
         if with_onnx:
             from tint_sumo.methods import onnx_files  # noqa: PLC0415 - an extra
 
@@ -61,6 +65,7 @@ def export_traits(name_or_path: str | Path, out: Path, *, with_onnx: bool = Fals
     model = traits.load(name_or_path)
     with whole_folder(out) as folder:
         _copy(find(name_or_path), folder / RUN_MODEL)
+        write_text(folder / PAGE, traits_page(Path(name_or_path).name, read_card(name_or_path).entries))
         if with_onnx:
             from tint_sumo.methods import onnx_files  # noqa: PLC0415 - an extra
 

@@ -10,6 +10,7 @@ from tint_sumo.config import Mix
 from tint_sumo.core.errors import find_named
 from tint_sumo.core.files import read_json, shipped
 from tint_sumo.core.percentages import percent
+from tint_sumo.methods.model_cards import policy_page, traits_page
 
 _FOLDERS = {"trait model": ".", "policy": "policies"}  # by kind, in the folder of the models
 _SHOWN_MIXES = ("P 0.25", "P 0.4", "P 0.6")  # of the results in a policy's card
@@ -30,6 +31,15 @@ class ShippedModel:
     def summary(self) -> dict[str, str]:
         """Return all but the card."""
         return {key: value for key, value in vars(self).items() if key != "card"}
+
+    def page(self) -> str:
+        """Return the model's card in the form of Hugging Face."""
+        return (policy_page if self.kind == "policy" else traits_page)(self.name, self.card)
+
+    @property
+    def page_file(self) -> Path:
+        """File of that card, beside the weights."""
+        return shipped("models") / _FOLDERS[self.kind] / f"{self.name}.md"
 
 
 def shipped_models() -> list[ShippedModel]:

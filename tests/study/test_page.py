@@ -352,6 +352,18 @@ def test_what_came_out_is_told_of_the_mixes_that_all_methods_met(results: dict[s
     assert what_came_out(rows).startswith(words) and bool(words) == bool(what_came_out(rows))
 
 
+def test_what_came_out_in_worlds_alone_is_the_mean_over_them() -> None:
+    fared = {"relative": ((3, 1, 0), (1, 3, 0)), "no_labels": ((2, 2, 0), (0, 4, 0))}
+    worlds = [Conditions(ALL_MIXES, world=name) for name in ("old", "eidm")]
+    rows = tabulate([trained(name, 0, dict(zip(worlds, counts, strict=True))) for name, counts in fared.items()])
+    assert what_came_out(rows) == (
+        "Over 2 worlds the method relative traits succeeded most often, in 50.0 % of the cases, and no labels least "
+        "often, in 25.0 %. The best method that infers traits, relative traits, reached 50.0 %; no labels, which "
+        "infers none, reached 25.0 %."
+    )
+    assert what_came_out([row for row in rows if row.conditions.world == "eidm"]).startswith("In EIDM the method")
+
+
 def test_failures_are_listed_folded_and_only_where_there_are_any() -> None:
     def recorded(method: str, fared: Evaluation, outcome: str, hit: Any = None) -> Recorded:
         return Recorded(Shown(method, "ttc", None, 0, fared), {0: {"outcome": outcome, "time_s": 10.0, "hit": hit}})

@@ -92,6 +92,11 @@ class Learned:
         """Whether its training does."""
         return self.source is true_traits or self.critic_sees_true_traits or self.trained_as is not None
 
+    @property
+    def infers_traits(self) -> bool:
+        """Whether it drives with traits that it infers from what the ego sees."""
+        return self.source not in (no_traits, true_traits)
+
     def make_source(self, encoder: "TraitModel | None", settings: PpoSettings) -> "TraitSource":
         """Return a new source of what the settings let the policy observe of the vehicles beside their positions."""
         from tint_sumo.policy.trait_sources import WithMotion

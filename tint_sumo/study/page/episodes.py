@@ -84,7 +84,7 @@ def player_data(recordings: Recordings) -> str:
 def _opening(policies: Sequence[Recorded]) -> Shown:
     """Return the policy that is shown first: the most successful one of those that infer traits, or else of all."""
     shown = [recorded.policy for recorded in policies]
-    inferring = [policy for policy in shown if getattr(METHODS.get(policy.method), "encoder", None)]
+    inferring = [policy for policy in shown if getattr(METHODS.get(policy.method), "infers_traits", False)]
     return max(inferring or shown, key=lambda policy: policy.evaluation.rate("success").value)
 
 

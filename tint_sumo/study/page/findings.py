@@ -1,11 +1,13 @@
 """The meaning of P and the main results, in a few sentences before all tables."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
+from tint_sumo.config import WORLDS
 from tint_sumo.core.percentages import percent
+from tint_sumo.envs.worlds import find_world
 from tint_sumo.methods.registry import METHODS, Learned
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.summary import Summary, at_mixes, by_title, over_all_mixes
+from tint_sumo.study.summary import Summary, at_mixes, by_title, in_worlds, over_all_mixes
 
 MEANING_OF_P = (
     "P is P(conservative): the probability that a driver is conservative, and yields when the ego moves in front of "
@@ -16,21 +18,19 @@ MEANING_OF_P = (
 def what_came_out(rows: Sequence[Summary]) -> str:
     """Return which method succeeded most often and which least often, and whether inferred traits helped.
 
-    Rates are means over the mixes of drivers that all methods were tested on; empty where there is none.
+    Rates are means over the mixes of drivers that all methods were tested on, or over worlds if policies were tested
+    in these alone; empty where there is none.
     """
     as_trained = [row for row in over_all_mixes(rows) if row.conditions == Conditions(row.conditions.p_conservative)]
-    methods = by_title(at_mixes(rows) or as_trained)
-    mixes = sorted(
-        set.intersection(*({row.conditions.p_conservative for row in tested} for tested in methods.values()))
-        if methods
-        else (),
-        key=str,
+    methods = by_title(at_mixes(rows) or as_trained or in_worlds(rows))
+    common = (
+        set.intersection(*({row.conditions for row in tested} for tested in methods.values())) if methods else set()
     )
-    if not mixes:
+    if not common:
         return ""
-    shown = by_title([row for tested in methods.values() for row in tested if row.conditions.p_conservative in mixes])
+    shown = by_title([row for tested in methods.values() for row in tested if row.conditions in common])
     rates = {title: sum(row.rate("success") for row in tested) / len(tested) for title, tested in shown.items()}
-    at = f"At P {_listed([mix.text for mix in mixes])}"
+    at = _where(common)
     if len(rates) == 1:
         ((title, rate),) = rates.items()
         return f"{at} the method {title} succeeded in {percent(rate)} % of the cases."
@@ -48,9 +48,17 @@ def what_came_out(rows: Sequence[Summary]) -> str:
     return text
 
 
+def _where(conditions: Collection[Conditions]) -> str:
+    """Return the conditions as the beginning of a sentence."""
+    worlds = [name for name in WORLDS if any(one.world == name for one in conditions)]
+    if worlds:
+        return f"In {find_world(worlds[0]).title}" if len(worlds) == 1 else f"Over {len(worlds)} worlds"
+    return f"At P {_listed(sorted(one.p_conservative.text for one in conditions))}"
+
+
 def _infers(name: str) -> bool:
     method = METHODS.get(name)
-    return isinstance(method, Learned) and method.encoder is not None
+    return isinstance(method, Learned) and method.infers_traits
 
 
 def _listed(words: Sequence[str]) -> str:

@@ -1,29 +1,35 @@
 """Test policies in worlds that their training has not met; writes a table.
 
-Usage: python scripts/measure_strangers.py RUNS [--cases 200] [--out data/results/strangers.csv]
+Usage: python scripts/measure_strangers.py RUNS [--cases 200] [--out data/results/strangers.csv] [--ship]
 
-RUNS is a folder of training runs METHOD.SEED, such as ``tint-sumo policy train --method oracle --world towns --budget
-strangers --seed 0 --out RUNS/oracle.0`` makes. A row of the table is a policy in a world; the rules and the shipped
-policies of the old world stand there, too. Rows that an earlier, interrupted call has written are kept.
+RUNS is a folder of training runs METHOD.SEED, such as ``tint-sumo policy train --method oracle --world strangers
+--budget strangers --seed 0 --out RUNS/oracle.0`` makes. A row of the table is a policy in a world; the rules and the
+shipped policies of the old world stand there, too. Rows that an earlier, interrupted call has written are kept.
+With --ship, data/models/policies/strangers gets the policy of each method's first seed; its card has the rates of all.
 """
 
 import argparse
 import csv
 import io
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from tint_sumo.config import ALL_MIXES, HELD_OUT_WORLDS
 from tint_sumo.core.determinism import single_threaded
-from tint_sumo.core.files import write_text
+from tint_sumo.core.files import write_json, write_text
 from tint_sumo.envs.worlds import find_world, task_in
 from tint_sumo.methods.evaluation import BUILT_IN_OUTCOMES, evaluate
 from tint_sumo.methods.loading import Contender, load_policy
+from tint_sumo.methods.training import POLICY
+from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 
 WORLDS = ("old", "towns", *HELD_OUT_WORLDS)
 OTHERS = ("ttc", "no_labels", "oracle")  # a rule, and policies of the old world
 CASE_SET = 600
+TRAINED_IN = "strangers"
+SHIPPED = Path(__file__).resolve().parents[1] / "data" / "models" / "policies" / TRAINED_IN
 FIELDS = ("trained_in", "method", "seed", "world", "cases", *(f"{outcome}_percent" for outcome in BUILT_IN_OUTCOMES))
 
 
@@ -33,7 +39,7 @@ def contenders(runs: Path) -> Iterator[tuple[str, str, str]]:
         yield "" if name == "ttc" else "old", name, name
     for folder in sorted(runs.iterdir()):
         if (folder / "policy.safetensors").exists():
-            yield "towns", folder.name.split(".")[0], str(folder)
+            yield TRAINED_IN, folder.name.split(".")[0], str(folder)
 
 
 def measure(contender: Contender, world: str, cases: int) -> dict[str, str]:
@@ -42,11 +48,33 @@ def measure(contender: Contender, world: str, cases: int) -> dict[str, str]:
     return {f"{outcome}_percent": f"{100 * found.rate(outcome).value:.1f}" for outcome in BUILT_IN_OUTCOMES}
 
 
+def ship(runs: Path, rows: Sequence[Mapping[str, str]]) -> None:
+    """Copy the policy of each method's first seed, with the method's rates in each world."""
+    trained = [row for row in rows if row["trained_in"] == TRAINED_IN]
+    for method in dict.fromkeys(row["method"] for row in trained):
+        of_method = [row for row in trained if row["method"] == method]
+        seeds = sorted({int(row["seed"]) for row in of_method})
+        results = {}
+        for world in WORLDS:
+            found = [row for row in of_method if row["world"] == world]
+            means = {
+                outcome: round(sum(float(row[f"{outcome}_percent"]) for row in found) / len(found) / 100, 4)
+                for outcome in BUILT_IN_OUTCOMES
+            }
+            results[world] = {"seeds": seeds, "episodes": int(found[0]["cases"]), **means}
+        run, shipped = runs / f"{method}.{seeds[0]}" / POLICY, SHIPPED / method
+        SHIPPED.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(weights_file(run), weights_file(shipped))
+        write_json(card_file(shipped), {**read_policy_card(run), "results": results})
+        print(f"wrote {weights_file(shipped)}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("runs", type=Path)
     parser.add_argument("--cases", type=int, default=200)
     parser.add_argument("--out", type=Path, default=Path("data/results/strangers.csv"))
+    parser.add_argument("--ship", action="store_true")
     given = parser.parse_args()
     rows = list(csv.DictReader(given.out.read_text().splitlines())) if given.out.exists() else []
     known = {(row["trained_in"], row["method"], row["seed"], row["world"], row["cases"]) for row in rows}
@@ -66,6 +94,8 @@ def main() -> None:
                 writer.writerows(rows)
                 write_text(given.out, text.getvalue())
     print(f"wrote {given.out}")
+    if given.ship:
+        ship(given.runs, rows)
 
 
 if __name__ == "__main__":

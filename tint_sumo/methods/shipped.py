@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tint_sumo.config import Mix
+from tint_sumo.config import WORLDS, Mix
 from tint_sumo.core.errors import find_named
 from tint_sumo.core.files import read_json, shipped
 from tint_sumo.core.percentages import percent
@@ -14,6 +14,7 @@ from tint_sumo.methods.model_cards import policy_page, traits_page
 
 _FOLDERS = {"trait model": ".", "policy": "policies"}  # by kind, in the folder of the models
 _SHOWN_MIXES = ("P 0.25", "P 0.4", "P 0.6")  # of the results in a policy's card
+_SHOWN_WORLDS = ("old", "held_out_towns")  # of one that drives among strangers
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,16 @@ def shipped_models() -> list[ShippedModel]:
         InputError: a card is damaged.
     """
     return [
-        _described(kind, weights)
+        _described(kind, weights, weights.relative_to(shipped("models") / folder).with_suffix("").as_posix())
         for kind, folder in _FOLDERS.items()
-        for weights in sorted((shipped("models") / folder).glob("*.safetensors"))
+        for weights in _weights(shipped("models") / folder, kind)
     ]
+
+
+def _weights(folder: Path, kind: str) -> list[Path]:
+    """Return the files of a kind of models; policies of other worlds than the old one are in folders of these."""
+    found = folder.rglob("*.safetensors") if kind == "policy" else folder.glob("*.safetensors")
+    return sorted(found, key=lambda file: (len(file.parts), file.name))
 
 
 def models_named(name: str) -> list[ShippedModel]:
@@ -79,7 +86,7 @@ def card_text(model: ShippedModel) -> str:
     return f"{model.kind} {model.name}\n{json.dumps(model.card, indent=2)}"
 
 
-def _described(kind: str, weights: Path) -> ShippedModel:
+def _described(kind: str, weights: Path, name: str) -> ShippedModel:
     card = read_json(weights.with_suffix(".json"), f"card of the {kind}")
     if kind == "policy":
         scene, training, result = card["scene"], _policy_training(card), _policy_result(card["results"])
@@ -89,14 +96,18 @@ def _described(kind: str, weights: Path) -> ShippedModel:
         mix = Mix.parse(data["p_conservative"]).text
         training = f"{card['windows']:,} windows, P {mix}, {settings['epochs']} epochs"
         result = f"{percent(card['accuracy'])}% of windows (linear SVC, noise {settings['noise_m']:g} m)"
-    return ShippedModel(weights.stem, kind, card["method"], scene, training, result, card)
+    return ShippedModel(name, kind, card["method"], scene, training, result, card)
 
 
 def _policy_training(card: Mapping[str, Any]) -> str:
     traits = f", traits of {card['traits']}" if card["traits"] else ""
-    return f"{card['steps']:,} decisions, P {Mix.parse(card['p_conservative']).text}, seed {card['seed']}{traits}"
+    sensors = f", {len(card['sensors'])} sensors" if "sensors" in card else ""
+    mix = Mix.parse(card["p_conservative"]).text
+    return f"{card['steps']:,} decisions, P {mix}, seed {card['seed']}{traits}{sensors}"
 
 
 def _policy_result(results: Mapping[str, Any]) -> str:
-    shown = [f"{percent(results[mix]['success'])}% at {mix}" for mix in _SHOWN_MIXES]
-    return f"success {', '.join(shown)} (mean of {len(results[_SHOWN_MIXES[0]]['seeds'])} seeds)"
+    mixes = [(mix, f"at {mix}") for mix in _SHOWN_MIXES if mix in results]
+    worlds = [(world, f"in {WORLDS[world].title}") for world in _SHOWN_WORLDS if world in results]
+    shown = [f"{percent(results[key]['success'])}% {where}" for key, where in mixes or worlds]
+    return f"success {', '.join(shown)} (mean of {len(next(iter(results.values()))['seeds'])} seeds)"

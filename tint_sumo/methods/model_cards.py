@@ -9,13 +9,17 @@ from typing import Any
 import yaml
 
 from tint_sumo import __version__
-from tint_sumo.config import Mix
+from tint_sumo.config import WORLDS, Mix
 from tint_sumo.core.percentages import percent
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import find_learned
 
-_ENVIRONMENT = "tint_sumo/TIntersection-v1"
+_ENVIRONMENT, _STRANGERS = "tint_sumo/TIntersection-v1", "tint_sumo/Strangers-v0"
 _LICENCE = "MIT, as the package."
+_P_OF_RESULTS = {
+    False: "P is the share of conservative drivers.",
+    True: "Each case has its own share of conservative drivers between 0.1 and 0.9.",
+}
 _TAGS = ["tint_sumo", "sumo", "autonomous-driving", "driver-traits"]
 
 
@@ -26,10 +30,10 @@ def policy_page(name: str, card: Mapping[str, Any]) -> str:
     index = [
         _result(
             "reinforcement-learning",
-            {"type": _ENVIRONMENT, "name": f"{_ENVIRONMENT}, {mix} (share of conservative drivers)"},
+            _tested_in(key),
             {f"{outcome}_rate": found[outcome] for outcome in BUILT_IN_OUTCOMES},
         )
-        for mix, found in results.items()
+        for key, found in results.items()
     ]
     head = _head(name, "reinforcement-learning", [*_TAGS, "reinforcement-learning", "ppo"], index)
     mix = "the drivers of a SUMO configuration"
@@ -41,10 +45,14 @@ def policy_page(name: str, card: Mapping[str, Any]) -> str:
         sees = f"It also sees {network['trait_size']} numbers of each, which a trait model ({learned.encoder}) infers."
     elif network["trait_size"] and learned.sees_true_traits:
         sees = "It also sees the true trait of each, which no car on a road could know."
+    elif learned.infers_traits:
+        sees = "It also sees how likely each is to yield, by its gaps compared with those of the other drivers."
+    if card["settings"].get("motion"):
+        sees = f"It sees the speed of each and the gap to its leader. {sees}"
     rows = [
-        f"| {mix_name} | {' | '.join(percent(found[outcome]) for outcome in BUILT_IN_OUTCOMES)} | "
+        f"| {_drivers(key)} | {' | '.join(percent(found[outcome]) for outcome in BUILT_IN_OUTCOMES)} | "
         f"{len(found['seeds'])} x {found['episodes']} |"
-        for mix_name, found in results.items()
+        for key, found in results.items()
     ]
     measured = "This policy has not been measured yet: `tint-sumo policy evaluate --model .` does that."
     if rows:
@@ -54,8 +62,8 @@ def policy_page(name: str, card: Mapping[str, Any]) -> str:
                 "| --- | --: | --: | --: | --: |",
                 *rows,
                 "",
-                "P is the share of conservative drivers. Rates are means over trainings with other seeds, of which "
-                f"this is number {card['seed']}. All cases are unseen ones of the scene that it was trained in.",
+                f"{_P_OF_RESULTS[next(iter(results)) in WORLDS]} Rates are means over trainings with other seeds, of "
+                f"which this is number {card['seed']}. All cases are unseen ones of the scene that it was trained in.",
             ]
         )
     return f"""{head}
@@ -100,6 +108,17 @@ policy = load_policy("FOLDER")  # of these files
 
 {_LICENCE}
 """
+
+
+def _tested_in(key: str) -> dict[str, str]:
+    """Return the environment of a result: a share of conservative drivers, or a world."""
+    if key in WORLDS:
+        return {"type": _STRANGERS, "name": f"{_STRANGERS}, world {key} ({WORLDS[key].title})"}
+    return {"type": _ENVIRONMENT, "name": f"{_ENVIRONMENT}, {key} (share of conservative drivers)"}
+
+
+def _drivers(key: str) -> str:
+    return WORLDS[key].title if key in WORLDS else key
 
 
 def traits_page(name: str, card: Mapping[str, Any]) -> str:

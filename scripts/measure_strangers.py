@@ -13,21 +13,16 @@ import csv
 import io
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
-from tint_sumo.config import ALL_MIXES, HELD_OUT_WORLDS
-from tint_sumo.core.determinism import single_threaded
+from tint_sumo.benchmark import evaluate, worlds_suite
 from tint_sumo.core.files import write_json, write_text
-from tint_sumo.envs.worlds import find_world, task_in
-from tint_sumo.methods.evaluation import BUILT_IN_OUTCOMES, evaluate
-from tint_sumo.methods.loading import Contender, load_policy
+from tint_sumo.methods.evaluation import BUILT_IN_OUTCOMES
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
+from tint_sumo.study.budgets import STRANGERS_TESTS
 
-WORLDS = ("old", "towns", *HELD_OUT_WORLDS)
 OTHERS = ("ttc", "no_labels", "oracle")  # a rule, and policies of the old world
-CASE_SET = 600
 TRAINED_IN = "strangers"
 SHIPPED = Path(__file__).resolve().parents[1] / "data" / "models" / "policies" / TRAINED_IN
 FIELDS = ("trained_in", "method", "seed", "world", "cases", *(f"{outcome}_percent" for outcome in BUILT_IN_OUTCOMES))
@@ -42,9 +37,8 @@ def contenders(runs: Path) -> Iterator[tuple[str, str, str]]:
             yield TRAINED_IN, folder.name.split(".")[0], str(folder)
 
 
-def measure(contender: Contender, world: str, cases: int) -> dict[str, str]:
-    task = task_in(find_world(world), replace(contender.task, p_conservative=ALL_MIXES))
-    found = evaluate(contender.policy, lambda count: contender.make_venv(count, task), cases, CASE_SET)
+def measure(name: str, world: str, cases: int) -> dict[str, str]:
+    found = evaluate(name, worlds_suite(world, [world]), cases=cases).evaluations[world]
     return {f"{outcome}_percent": f"{100 * found.rate(outcome).value:.1f}" for outcome in BUILT_IN_OUTCOMES}
 
 
@@ -55,7 +49,7 @@ def ship(runs: Path, rows: Sequence[Mapping[str, str]]) -> None:
         of_method = [row for row in trained if row["method"] == method]
         seeds = sorted({int(row["seed"]) for row in of_method})
         results = {}
-        for world in WORLDS:
+        for world in STRANGERS_TESTS:
             found = [row for row in of_method if row["world"] == world]
             means = {
                 outcome: round(sum(float(row[f"{outcome}_percent"]) for row in found) / len(found) / 100, 4)
@@ -78,21 +72,19 @@ def main() -> None:
     given = parser.parse_args()
     rows = list(csv.DictReader(given.out.read_text().splitlines())) if given.out.exists() else []
     known = {(row["trained_in"], row["method"], row["seed"], row["world"], row["cases"]) for row in rows}
-    with single_threaded():
-        for trained_in, method, name in contenders(given.runs):
-            contender = load_policy(name)
-            for world in WORLDS:
-                seed = Path(name).suffix[1:]
-                key = (trained_in, method, seed, world, str(given.cases))
-                if key in known:
-                    continue
-                rows.append(dict(zip(FIELDS, key, strict=False)) | measure(contender, world, given.cases))
-                print(*rows[-1].values(), flush=True)
-                text = io.StringIO()
-                writer = csv.DictWriter(text, FIELDS, lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(rows)
-                write_text(given.out, text.getvalue())
+    for trained_in, method, name in contenders(given.runs):
+        for world in STRANGERS_TESTS:
+            seed = Path(name).suffix[1:]
+            key = (trained_in, method, seed, world, str(given.cases))
+            if key in known:
+                continue
+            rows.append(dict(zip(FIELDS, key, strict=False)) | measure(name, world, given.cases))
+            print(*rows[-1].values(), flush=True)
+            text = io.StringIO()
+            writer = csv.DictWriter(text, FIELDS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+            write_text(given.out, text.getvalue())
     print(f"wrote {given.out}")
     if given.ship:
         ship(given.runs, rows)

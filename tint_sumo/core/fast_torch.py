@@ -21,11 +21,6 @@ def wide_products(wanted: bool = True) -> AbstractContextManager[None]:
     return _precision("medium") if wanted and _stays_float32() else nullcontext()
 
 
-def narrow_products() -> AbstractContextManager[None]:
-    """Let torch multiply float32 matrices with MKL in the block: small products wait less for it."""
-    return _precision("highest")
-
-
 @contextmanager
 def _precision(name: str) -> Iterator[None]:
     before = torch.get_float32_matmul_precision()

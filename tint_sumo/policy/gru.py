@@ -1,15 +1,15 @@
 """A gated recurrent unit over sequences with resets, fast on a processor."""
 
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from tint_sumo.core.fast_torch import narrow_products
+from tint_sumo.policy.recurrence import run, run_back
 
-_MANY_PRODUCTS = 1_000_000  # of numbers, in a product of matrices; with fewer, oneDNN's calls take longer than MKL's
+_MANY_PRODUCTS = 4_000_000  # of numbers, in one step; with more, torch's products are faster than compiled loops
 
 
 class ResetGru(nn.Module):
@@ -46,7 +46,7 @@ class ResetGru(nn.Module):
         projected = nn.functional.linear(inputs, self.weight_ih, self.bias_ih)
         weight_hh = self.weight_hh.to(projected.dtype)
         keep = (1.0 - episode_starts.to(hidden.dtype)).unsqueeze(-1)
-        recurrence: Any = _Recurrence.apply
+        recurrence: Any = (_CompiledRecurrence if _compiles(hidden, weight_hh) else _Recurrence).apply
         outputs = cast(Tensor, recurrence(projected.to(hidden.dtype), hidden, keep, weight_hh, self.bias_hh))
         return outputs, outputs[-1]
 
@@ -62,14 +62,13 @@ class _Recurrence(torch.autograd.Function):
         outputs = torch.empty_like(candidates)
         state, recurrent, product_bias, columns = hidden, [], bias.to(weight.dtype), weight.t().contiguous()
         steps = zip(*(t.unbind(0) for t in (projected, keep, gates, candidates, outputs)), strict=True)
-        with _products_of(hidden, weight):
-            for project, kept, gate, candidate, output in steps:
-                previous = state * kept
-                product = torch.addmm(product_bias, previous.to(weight.dtype), columns).to(hidden.dtype)
-                torch.add(project[:, : 2 * size], product[:, : 2 * size], out=gate).sigmoid_()
-                recurrent.append(product[:, 2 * size :])  # the candidate's recurrent part, before the reset gate
-                torch.addcmul(project[:, 2 * size :], gate[:, :size], recurrent[-1], out=candidate).tanh_()
-                state = torch.lerp(candidate, previous, gate[:, size:], out=output)
+        for project, kept, gate, candidate, output in steps:
+            previous = state * kept
+            product = torch.addmm(product_bias, previous.to(weight.dtype), columns).to(hidden.dtype)
+            torch.add(project[:, : 2 * size], product[:, : 2 * size], out=gate).sigmoid_()
+            recurrent.append(product[:, 2 * size :])  # the candidate's recurrent part, before the reset gate
+            torch.addcmul(project[:, 2 * size :], gate[:, :size], recurrent[-1], out=candidate).tanh_()
+            state = torch.lerp(candidate, previous, gate[:, size:], out=output)
         ctx.save_for_backward(hidden, keep, weight, gates, candidates, torch.stack(recurrent), outputs)
         return outputs
 
@@ -94,12 +93,11 @@ class _Recurrence(torch.autograd.Function):
         grad_states = torch.empty_like(outputs)
         grad_hidden = torch.zeros_like(hidden)
         steps = [t.unbind(0) for t in (grad_outputs, keep, update, slopes, grad_products, grad_states)]
-        with _products_of(hidden, weight):
-            for grad_output, kept, gate, slope, grad_product, grad_state in zip(*map(reversed, steps), strict=True):
-                torch.add(grad_output, grad_hidden, out=grad_state)
-                torch.mul(slope, grad_state.to(weight.dtype).unsqueeze(1), out=grad_product)
-                through_product = grad_product.flatten(1) @ weight
-                grad_hidden = torch.addcmul(through_product.to(hidden.dtype), grad_state, gate).mul_(kept)
+        for grad_output, kept, gate, slope, grad_product, grad_state in zip(*map(reversed, steps), strict=True):
+            torch.add(grad_output, grad_hidden, out=grad_state)
+            torch.mul(slope, grad_state.to(weight.dtype).unsqueeze(1), out=grad_product)
+            through_product = grad_product.flatten(1) @ weight
+            grad_hidden = torch.addcmul(through_product.to(hidden.dtype), grad_state, gate).mul_(kept)
         flat = grad_products.flatten(0, 1).flatten(1)
         grad_weight = flat.T @ previous.flatten(0, 1).to(weight.dtype)
         grad_bias = flat.sum(0).to(hidden.dtype)
@@ -107,9 +105,44 @@ class _Recurrence(torch.autograd.Function):
         return grad_products.flatten(2).to(hidden.dtype), grad_hidden, None, grad_weight, grad_bias
 
 
-def _products_of(hidden: Tensor, weight: Tensor) -> AbstractContextManager[None]:
-    """Return the block for products of states and weights: small ones would wait for oneDNN."""
-    return narrow_products() if len(hidden) * weight.numel() < _MANY_PRODUCTS else nullcontext()
+class _CompiledRecurrence(torch.autograd.Function):
+    """The same in float32 on a processor, for few and small states: one compiled call for all steps."""
+
+    @staticmethod
+    def forward(ctx: Any, projected: Tensor, hidden: Tensor, keep: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        steps, (count, size) = len(projected), hidden.shape
+        states = torch.cat([hidden.unsqueeze(0), hidden.new_empty(steps, count, size)])
+        gates, recurrent = hidden.new_empty(projected.shape), hidden.new_empty(steps, count, size)
+        columns = _padded(weight.t())
+        run(*_arrays(projected, keep.squeeze(-1), bias, columns, states, gates, recurrent))
+        ctx.save_for_backward(keep, weight, states, gates, recurrent)
+        return states[1:]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_outputs: Tensor) -> tuple[Tensor, Tensor, None, Tensor, Tensor]:
+        keep, weight, states, gates, recurrent = ctx.saved_tensors
+        grad_projected, grad_products = gates.new_empty(2, *gates.shape)
+        previous, grad_hidden = recurrent.new_empty(recurrent.shape), recurrent.new_empty(recurrent.shape[1:])
+        given = (grad_outputs, keep.squeeze(-1), _padded(weight), states, gates, recurrent)
+        run_back(*_arrays(*given, grad_projected, grad_products, previous, grad_hidden))
+        flat = grad_products.flatten(0, 1)
+        return grad_projected, grad_hidden, None, flat.t() @ previous.flatten(0, 1), flat.sum(0)
+
+
+def _compiles(hidden: Tensor, weight: Tensor) -> bool:
+    """Return whether compiled steps take states and weights, and are faster than torch's."""
+    small = len(hidden) * weight.numel() < _MANY_PRODUCTS
+    return small and weight.device.type == "cpu" and weight.dtype == hidden.dtype == torch.float32
+
+
+def _padded(matrix: Tensor) -> Tensor:
+    """Return a matrix with rows of zeros up to a multiple of 4."""
+    return nn.functional.pad(matrix, (0, 0, 0, -len(matrix) % 4)) if len(matrix) % 4 else matrix
+
+
+def _arrays(*tensors: Tensor) -> list[np.ndarray]:
+    return [tensor.detach().contiguous().numpy() for tensor in tensors]
 
 
 def _tanh_slope(outer: Tensor, output: Tensor) -> Tensor:

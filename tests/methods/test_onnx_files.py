@@ -1,20 +1,21 @@
 """Policies and trait models as ONNX files: driven by onnxruntime, they act as the originals do."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tests.scenes.networks import lights
-from tint_sumo.config import EgoController, PpoSettings
+from tint_sumo.config import ALL_MIXES, EgoController, PpoSettings
 from tint_sumo.methods.driving import drive
 from tint_sumo.methods.evaluation import case_seed
 from tint_sumo.methods.loading import Contender, load_policy
 from tint_sumo.methods.training import train_policy
+from tint_sumo.policy import GruPolicy
 from tint_sumo.policy.trait_sources import Frame, TraitSource
 
 onnxruntime = pytest.importorskip("onnxruntime", reason='needs: pip install "tint_sumo[onnx]"')
@@ -70,6 +71,32 @@ class OnnxPolicy:
         return action, hidden
 
 
+class Compared:
+    """A policy and its file, which choose for the same observations what the policy thinks best.
+
+    One that has hardly been trained often thinks two speeds as good as equal, and either may be chosen then.
+    """
+
+    def __init__(self, contender: Contender, file: Path) -> None:
+        assert isinstance(contender.policy, GruPolicy)
+        self.policy, self.file, self.decisions = contender.policy, OnnxPolicy(file, contender), 0
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> Any:
+        before, hidden = (None, None) if state is None else state
+        actions, after = self.policy.predict(observation, before, episode_start, deterministic)
+        found, hidden = self.file.predict(observation, hidden, episode_start)
+        tensors, _ = self.policy.obs_to_tensor(observation)
+        states = self.policy.initial_states(len(found)) if before is None else torch.from_numpy(before[0])
+        latent, _ = self.policy.latent_actor(tensors, states, torch.from_numpy(episode_start))
+        logits = self.policy.action_net(latent).numpy()
+        assert (logits.max(axis=1) - logits[np.arange(len(found)), found] < 1e-5).all()
+        np.testing.assert_allclose(hidden, after[0], atol=1e-5)
+        self.decisions += len(found)
+        return actions, (after, hidden)
+
+
 class OnnxTraits(TraitSource):
     """Traits of a file, of windows or of whole tracks, taken as the page ``docs/how-to/robots.md`` says."""
 
@@ -121,23 +148,32 @@ def driven(contender: Contender, episodes: int, batch: int = 40) -> list[tuple[l
 def require_same(contender: Contender, folder: Path, episodes: int = 40, batch: int = 40) -> Contender:
     """Drive a policy, and then its files, and compare all actions of so many episodes; returns the files' driver."""
     onnx_files.write_policy(contender, folder / "policy.onnx")
-    source: Callable[[], TraitSource] | None = contender.source
+    files = replace(contender, policy=OnnxPolicy(folder / "policy.onnx", contender))
     steps = onnx_files.steps_of(contender)
     if steps is not None:
         onnx_files.write_traits(steps, contender.name, folder / "traits.onnx")
         windows = "window" in steps.begins
-        source = lambda: OnnxTraits(folder / "traits.onnx", windows=windows)  # noqa: E731
-    files = replace(contender, policy=OnnxPolicy(folder / "policy.onnx", contender), source=source)
+        files = replace(files, source=lambda: OnnxTraits(folder / "traits.onnx", windows=windows))
     expected = driven(contender, episodes, batch)
     assert sum(len(actions) for actions, _ in expected) >= STEPS
-    assert len({action for actions, _ in expected for action in actions}) > 1
     assert driven(files, episodes, batch) == expected
     return files
 
 
+def compare(contender: Contender, file: Path, episodes: int, batch: int) -> Compared:
+    """Drive so many episodes with a policy, and ask its file at each decision, too."""
+    onnx_files.write_policy(contender, file)
+    compared = Compared(contender, file)
+    driven(replace(contender, policy=compared), episodes, batch)
+    assert compared.decisions >= STEPS
+    return compared
+
+
 @pytest.mark.slow
 def test_files_act_as_policy_and_trait_model_do_and_say_what_they_take(tmp_path: Path) -> None:
-    files = require_same(load_policy("streaming"), tmp_path)
+    contender = load_policy("streaming")
+    files = require_same(contender, tmp_path)
+    assert {action for actions, _ in driven(contender, 5) for action in actions} == {0, 1, 2}
     assert isinstance(files.policy, OnnxPolicy)
     metadata = files.policy.file.metadata
     assert metadata["desired_speeds_mps"] == [0.0, 0.5, 3.0]
@@ -166,9 +202,18 @@ def test_files_of_all_shipped_kinds_act_as_the_policies_do(name: str, tmp_path: 
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("method", ["streaming", "no_labels", "relative"])
+def test_files_of_policies_that_see_motion_act_as_these_do(method: str, tmp_path: Path, tiny: PpoSettings) -> None:
+    settings = replace(tiny, motion=True)
+    train_policy(method, ALL_MIXES, 64, 0, tmp_path / "run", settings=settings)
+    compared = compare(load_policy(tmp_path / "run"), tmp_path / "policy.onnx", episodes=10, batch=10)
+    assert compared.file.file.inputs["traits"]["meaning"].startswith("of each vehicle: speed / 3 m/s")
+
+
+@pytest.mark.long
 def test_files_of_policies_for_sumo_configurations_act_as_these_do(tmp_path: Path, tiny: PpoSettings) -> None:
     perceives = ("traffic_light", "right_of_way", "speed_limit", "lane", "pedestrians")
     controller = EgoController((0.0, 4.0, 8.0, 11.0))
     scene = lights(tmp_path, 0.5).scene(controller=controller, warm_up_s=5.0, time_limit_s=60.0, perceives=perceives)
     train_policy("no_labels", None, 64, 0, tmp_path / "run", settings=tiny, scene=scene)
-    require_same(load_policy(tmp_path / "run"), tmp_path, episodes=14, batch=1)
+    compare(load_policy(tmp_path / "run"), tmp_path / "policy.onnx", episodes=14, batch=1)

@@ -26,21 +26,23 @@ from tint_sumo import ENV_IDS
 from tint_sumo.cli import main as tint_sumo
 from tint_sumo.comparisons.traits import TraitStudy
 from tint_sumo.comparisons.traits_report import plot_noise
-from tint_sumo.config import POPULATIONS, SENSORS, Mix, Sensor, Traffic
+from tint_sumo.config import ALL_MIXES, POPULATIONS, SENSORS, Mix, Sensor, Traffic
 from tint_sumo.core.files import write_json
+from tint_sumo.core.statistics import Rate
 from tint_sumo.envs import SceneEnv, TaskSettings
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import Learned, find_method, needed_encoders
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
-from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene
+from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene, paper_scene
 from tint_sumo.scenes.drivers import DriverMember, members
 from tint_sumo.scenes.geometry import clearance_m
 from tint_sumo.simulation import SceneSimulation, Simulation
-from tint_sumo.study.budgets import BUDGETS
-from tint_sumo.study.figures import plot_bars, plot_conditions
+from tint_sumo.study.budgets import BUDGETS, Conditions
+from tint_sumo.study.figures import plot_bars, plot_conditions, plot_worlds
 from tint_sumo.study.jobs import label
-from tint_sumo.study.results import read_results
-from tint_sumo.study.results_csv import read_csv
+from tint_sumo.study.results import GIVEN, TRAINED, read_results
+from tint_sumo.study.results_csv import StoredRow, read_csv
 from tint_sumo.study.summary import at_mixes, over_all_mixes, tabulate
 from tint_sumo.traits.datasets import evaluate_traits
 from tint_sumo.traits.storage import add_to_card
@@ -124,6 +126,34 @@ def make_figures(images: Path) -> None:
     plot_bars(at_mixes(rows), images / "navigation.png")
     plot_conditions(over_all_mixes(rows), images / "conditions.png")
     plot_noise(pandas.read_csv(DATA / "results" / "traits.csv"), images / "traits.png")
+    plot_worlds(rows_of_strangers(), images / "strangers.png")
+
+
+def rows_of_strangers() -> list[StoredRow]:
+    """Return the rows of ``strangers.csv``: a method's seeds in one, with intervals over all of their cases."""
+    table = pandas.read_csv(DATA / "results" / "strangers.csv", keep_default_na=False)
+    table["is_trained"] = table["trained_in"] == "strangers"
+    rows = []
+    for (is_trained, method, world), found in table.groupby(["is_trained", "method", "world"], sort=False):
+        cases, seeds = int(found["cases"].iloc[0]), tuple(range(len(found)))
+        counts = {outcome: found[f"{outcome}_percent"].sum() * cases / 100 for outcome in BUILT_IN_OUTCOMES}
+        rates = {outcome: Rate(round(count), cases * len(seeds)) for outcome, count in counts.items()}
+        rows.append(
+            StoredRow(
+                method,
+                TRAINED if is_trained else GIVEN,
+                ALL_MIXES if is_trained else None,
+                Conditions(ALL_MIXES, world=world),
+                seeds,
+                paper_scene().tau_s,
+                cases,
+                {outcome: rate.value for outcome, rate in rates.items()},
+                {outcome: rate.interval for outcome, rate in rates.items()},
+                dict.fromkeys(BUILT_IN_OUTCOMES),
+                None,
+            )
+        )
+    return rows
 
 
 def make_pictures(images: Path) -> None:

@@ -420,7 +420,7 @@ def test_the_table_of_policies_among_strangers_is_that_of_the_results() -> None:
         method, _, seed = (
             name.replace("`", "").replace("no labels, old", "no_labels old").replace(",", "").partition(" ")
         )
-        columns.append((method, "", "old") if seed == "old" else (method, seed, "towns" if seed else ""))
+        columns.append((method, "", "old") if seed == "old" else (method, seed, "strangers" if seed else ""))
     assert len(lines) * len(columns) == len(measured)
     for line in lines:
         world, *cells = line.strip("| ").split(" | ")

@@ -24,7 +24,7 @@ def make_shipped(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_figures_are_drawn_from_the_shipped_tables(make_shipped: ModuleType, tmp_path: Path) -> None:
     make_shipped.make_figures(tmp_path)
-    assert_pictures_are_shipped(tmp_path, {"navigation.png", "conditions.png", "traits.png"})
+    assert_pictures_are_shipped(tmp_path, {"navigation.png", "conditions.png", "traits.png", "strangers.png"})
 
 
 @pytest.mark.long

@@ -35,7 +35,7 @@ def find_named(kind: str, name: str, known: Mapping[str, T]) -> T:
         InputError: there is none of this name.
     """
     if name not in known:
-        raise InputError(f"unknown {kind} {name!r}; choose one of: {', '.join(known)}")
+        raise InputError(f"unknown {kind} {shown(name)}; choose one of: {', '.join(known)}")
     return known[name]
 
 

@@ -110,4 +110,5 @@ def _policy_result(results: Mapping[str, Any]) -> str:
     mixes = [(mix, f"at {mix}") for mix in _SHOWN_MIXES if mix in results]
     worlds = [(world, f"in {WORLDS[world].title}") for world in _SHOWN_WORLDS if world in results]
     shown = [f"{percent(results[key]['success'])}% {where}" for key, where in mixes or worlds]
-    return f"success {', '.join(shown)} (mean of {len(next(iter(results.values()))['seeds'])} seeds)"
+    seeds = len(next(iter(results.values()))["seeds"])
+    return f"success {', '.join(shown)} ({f'mean of {seeds} seeds' if seeds > 1 else '1 seed'})"

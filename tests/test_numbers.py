@@ -399,6 +399,25 @@ def test_the_table_of_relative_traits_is_that_of_the_results() -> None:
             assert cell == f"{100 * row['accuracy']:.1f} ({100 * row['calibration_error']:.1f})"
 
 
+@pytest.mark.parametrize("p_conservative", [0.1, 0.25])
+def test_the_numbers_of_the_planner_are_those_of_its_cases(p_conservative: float) -> None:
+    cases = pandas.read_csv(RESULTS / "planner.csv")
+    cases = cases[cases["p_conservative"] == p_conservative]
+    in_ceiling, finished = cases["ceiling"] == "yes", cases["oracle"] == "success"
+    searched, found = cases["planner"] != "not searched", cases["planner"] == "success"
+    between = in_ceiling & ~finished
+    assert searched[between].all()
+    numbers = [len(cases), finished.sum(), in_ceiling.sum(), found[between].sum(), between.sum()]
+    assert [searched[finished].sum(), searched[~in_ceiling].sum()] == [8, 8]
+    assert found[finished & searched].all() and not found[~in_ceiling].any()
+    told = (
+        rf"(\d+) cases at P {p_conservative:g} the oracle finishes (\d+) and the ceiling has (\d+), and "
+        r"in (\d+) of the (\d+) cases between"
+    )
+    match = re.search(told, _prose("docs/results/index.md"))
+    assert match is not None and [int(number) for number in match.groups()] == numbers
+
+
 def test_the_numbers_of_adaptation_are_those_of_the_results() -> None:
     page = (DOCS / "explanation" / "strangers.md").read_text()
     (words,) = re.findall(r"### Getting to know a town\n(.*?)\n## ", page, re.DOTALL)

@@ -55,7 +55,7 @@ def test_suites_are_the_mixes_of_the_paper_and_the_held_out_worlds() -> None:
     assert [trial.world for trial in SUITES["strangers"].trials] == list(HELD_OUT_WORLDS)
     with pytest.raises(InputError, match="unknown suite 'towns'; choose one of: paper, strangers"):
         evaluate("ttc", "towns")
-    with pytest.raises(InputError, match="a policy is a name, a path, a function, or has `predict`; 3 is none"):
+    with pytest.raises(InputError, match="a policy is a name, a path, a function, or has a method predict, not 3"):
         evaluate(3, "paper")  # type: ignore[arg-type]
 
 

@@ -141,7 +141,7 @@ def _driver(policy: str | Path | Policy | Function) -> tuple[Policy, Callable[..
         return cast(Policy, policy), _bare_venv, task
     if callable(policy):
         return _EachAlone(policy), _bare_venv, task
-    raise InputError(f"a policy is a name, a path, a function, or has `predict`; {shown(policy)} is none of these")
+    raise InputError(f"a policy is a name, a path, a function, or has a method predict, not {shown(policy)}")
 
 
 def _bare_venv(num_envs: int, task: TaskSettings) -> VecEnv:
@@ -201,7 +201,7 @@ def read_leaderboard(file: str | Path) -> list[Entry]:
         if one.world not in trials or not one.outcomes or set(one.outcomes) - set(LETTERS):
             raise InputError(
                 f"{file}: {one.name} in {one.world} needs a world of suite {one.suite} and outcomes of the letters "
-                f"{', '.join(LETTERS)}; write the row with `measure`"
+                f"{', '.join(LETTERS)}; write the row with scripts/leaderboard.py add"
             )
     return entries
 

@@ -10,14 +10,15 @@ that an earlier, interrupted call has written are kept.
 
 import argparse
 import csv
-import io
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import pandas
+
 from tint_sumo.config import Mix
 from tint_sumo.core.determinism import single_threaded
-from tint_sumo.core.files import write_text
+from tint_sumo.core.files import write_frame
 from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.evaluation import REPORTED_SET, evaluate
 from tint_sumo.methods.loading import load_policy
@@ -58,11 +59,7 @@ def main() -> None:
                 row = (f"{p:g}", str(case), "yes" if in_ceiling else "no", outcome, found)
                 rows.append(dict(zip(FIELDS, row, strict=True)))
                 print(*row, flush=True)
-                text = io.StringIO()
-                writer = csv.DictWriter(text, FIELDS, lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(rows)
-                write_text(given.out, text.getvalue())
+                write_frame(pandas.DataFrame(rows), given.out)
     print(f"wrote {given.out}")
 
 

@@ -10,13 +10,14 @@ With --ship, data/models/policies/strangers gets the policy of each method's fir
 
 import argparse
 import csv
-import io
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import pandas
+
 from tint_sumo.benchmark import evaluate, worlds_suite
-from tint_sumo.core.files import write_json, write_text
+from tint_sumo.core.files import write_frame, write_json
 from tint_sumo.methods.evaluation import BUILT_IN_OUTCOMES
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
@@ -80,11 +81,7 @@ def main() -> None:
                 continue
             rows.append(dict(zip(FIELDS, key, strict=False)) | measure(name, world, given.cases))
             print(*rows[-1].values(), flush=True)
-            text = io.StringIO()
-            writer = csv.DictWriter(text, FIELDS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-            write_text(given.out, text.getvalue())
+            write_frame(pandas.DataFrame(rows), given.out)
     print(f"wrote {given.out}")
     if given.ship:
         ship(given.runs, rows)

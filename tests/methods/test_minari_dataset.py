@@ -14,6 +14,7 @@ from filelock import FileLock
 from minari.dataset.minari_dataset import EpisodeData
 
 from tests.scenes.networks import UserNetwork
+from tint_sumo.core import files
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import LOCK_FILE
 from tint_sumo.core.progress import Progress
@@ -182,7 +183,7 @@ def test_what_a_killed_process_has_left_is_removed_but_not_what_a_running_one_wr
     left.mkdir(parents=True)
     (left / "main_data.hdf5").write_text("half")
     one, lock = replace(EPISODES, episodes=1), FileLock(left.parent / LOCK_FILE)
-    monkeypatch.setattr(minari_dataset, "LOCK_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(files, "LOCK_TIMEOUT_S", 0.1)
     with lock, pytest.raises(InputError, match="wait for it, or give another name as `minari`"):
         record_minari("mine/a-v0", one, root=tmp_path)
     assert (left / "main_data.hdf5").read_text() == "half"

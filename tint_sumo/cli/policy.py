@@ -136,8 +136,8 @@ class TrainPolicy(NetworkCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluatePolicy(NetworkCommand, SpreadCommand):
-    """Evaluate a policy on unseen test episodes (cases), which are the same for every policy."""
+class PolicyCommand(NetworkCommand):
+    """Base class of commands that let a policy drive among drivers and with a sensor that the user chooses."""
 
     model: PolicyName
     p_conservative: TestMix = None
@@ -147,22 +147,51 @@ class EvaluatePolicy(NetworkCommand, SpreadCommand):
     noise: NoiseM = 0.0
     """Standard deviation of the noise on the others' positions, m, with a sensor that has none."""
     tau: TestTau = None
+    allow_pickle: bool = False
+    """Read .zip files, which can run any code: for files that you trust alone."""
+
+    def load(self) -> "tuple[Contender, TaskSettings]":
+        """Return the policy, and the settings of its environments; what is not given is as in its training."""
+        from tint_sumo.methods.loading import load_policy
+
+        contender = load_policy(self.model, scene=self.scene_of(self.scene), allow_pickle=self.allow_pickle)
+        return contender, self._task(contender)
+
+    def _task(self, contender: "Contender") -> "TaskSettings":
+        """Raise InputError if there are two noises, or two sensors."""
+        from tint_sumo.envs.episodes import find_sensor
+        from tint_sumo.envs.worlds import find_world, task_in
+
+        mix = contender.p_conservative if self.p_conservative is None else Mix.parse(self.p_conservative)
+        task = replace(contender.task, p_conservative=mix, tau_s=self.tau)
+        if self.world is not None:
+            require_one_sensor(self.sensor)
+            task = task_in(find_world(self.world), task)
+        if self.sensor is not None:
+            task = replace(task, sensor=find_sensor(self.sensor))
+        if self.noise == 0.0:
+            return task
+        if task.sensor.noise_m not in (0.0, self.noise):
+            raise InputError(f"`noise` is {self.noise:g} m, and {task.sensor.noise_m:g} m in the sensor; give it once")
+        return replace(task, sensor=replace(task.sensor, noise_m=self.noise))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluatePolicy(PolicyCommand, SpreadCommand):
+    """Evaluate a policy on unseen test episodes (cases), which are the same for every policy."""
+
     episodes: Cases = 500
     """Number of cases."""
     seed: Seed = 0
     """Number of the case set, 0 to 1000."""
-    allow_pickle: bool = False
-    """Read .zip files, which can run any code: for files that you trust alone."""
 
     def run(self) -> Outcome:
         from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.evaluation import evaluate
         from tint_sumo.methods.evaluation_jobs import evaluate_on
-        from tint_sumo.methods.loading import load_policy
 
         use_one_thread()
-        contender = load_policy(self.model, scene=self.scene_of(self.scene), allow_pickle=self.allow_pickle)
-        task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau, self.world)
+        contender, task = self.load()
         with self.workers_of(1) as workers:
             if isinstance(workers, int):
                 with one_job(f"evaluate {self.model}") as report:
@@ -192,19 +221,11 @@ class EvaluatePolicy(NetworkCommand, SpreadCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordPolicy(NetworkCommand):
+class RecordPolicy(PolicyCommand):
     """Record episodes of a policy as a Minari dataset for offline learning; none of them is a test case."""
 
-    model: PolicyName
     minari: Annotated[str, _MINARI]
     out: Annotated[Path | None, _ROOT] = None
-    p_conservative: TestMix = None
-    world: WorldName = None
-    scene: TestScene = None
-    sensor: TestSensor = None
-    noise: NoiseM = 0.0
-    """Standard deviation of the noise on the others' positions, m, with a sensor that has none."""
-    tau: TestTau = None
     episodes: Cases = 500
     """Number of episodes."""
     random_actions: Fraction = 0.0
@@ -217,12 +238,9 @@ class RecordPolicy(NetworkCommand):
     author_email: Annotated[str | None, optional("ADDRESS", "The author's address.")] = None
     code_permalink: Annotated[str | None, optional("URL", "Code with which the dataset was made.")] = None
     description: Annotated[str | None, optional("TEXT", "Description.", "policy, scene and outcomes")] = None
-    allow_pickle: bool = False
-    """Read .zip files, which can run any code: for files that you trust alone."""
 
     def run(self) -> Outcome:
         from tint_sumo.jobs.table import one_job
-        from tint_sumo.methods.loading import load_policy
 
         try:
             from tint_sumo.methods.minari_dataset import Credits, PolicyEpisodes, record_minari
@@ -231,8 +249,7 @@ class RecordPolicy(NetworkCommand):
                 raise
             raise InputError('--minari needs Minari; install it: pip install "tint_sumo[minari]"') from None
         use_one_thread()
-        contender = load_policy(self.model, scene=self.scene_of(self.scene), allow_pickle=self.allow_pickle)
-        task = task_of(contender, self.p_conservative, self.sensor, self.noise, self.tau, self.world)
+        _, task = self.load()
         episodes = PolicyEpisodes(
             self.model, task, self.episodes, self.seed, self.random_actions, allow_pickle=self.allow_pickle
         )
@@ -323,36 +340,6 @@ class Policy:
         | Annotated[ExportPolicy, subcommand("export")]
         | Annotated[SweepPolicy, subcommand("sweep")]
     )
-
-
-def task_of(
-    contender: "Contender",
-    p_conservative: MixFlag | None,
-    sensor: "str | Sensor | None",
-    noise_m: float,
-    tau_s: float | None,
-    world: str | None,
-) -> "TaskSettings":
-    """Return the settings of the environments that flags ask for; what is not given is as in the policy's training.
-
-    Raises:
-        InputError: there are two noises, or two sensors.
-    """
-    from tint_sumo.envs.episodes import find_sensor
-    from tint_sumo.envs.worlds import find_world, task_in
-
-    mix = contender.p_conservative if p_conservative is None else Mix.parse(p_conservative)
-    task = replace(contender.task, p_conservative=mix, tau_s=tau_s)
-    if world is not None:
-        require_one_sensor(sensor)
-        task = task_in(find_world(world), task)
-    if sensor is not None:
-        task = replace(task, sensor=find_sensor(sensor))
-    if noise_m == 0.0:
-        return task
-    if task.sensor.noise_m not in (0.0, noise_m):
-        raise InputError(f"`noise` is {noise_m:g} m, and {task.sensor.noise_m:g} m in the sensor; give it once")
-    return replace(task, sensor=replace(task.sensor, noise_m=noise_m))
 
 
 def require_one_sensor(sensor: "str | Sensor | None") -> None:

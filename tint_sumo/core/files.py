@@ -230,12 +230,7 @@ def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bo
     _require_home(folder, wanted)
     _require_writable(folder, "out")
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / LOCK_FILE, timeout=LOCK_TIMEOUT_S)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise InputError(f"another process is working in {folder}; wait for it or choose another `out`") from None
-    try:
+    with locked(folder, f"another process is working in {folder}; wait for it or choose another `out`"):
         _require_home(folder, wanted)
         for partial in folder.rglob(".*.partial"):
             partial.unlink(missing_ok=True)
@@ -244,6 +239,22 @@ def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bo
             write_json(folder / RUN_FILE, wanted)
         with made_by(None):
             yield
+
+
+@contextmanager
+def locked(folder: Path, refusal: str) -> Iterator[None]:
+    """Let one process at a time work in a folder, in the block.
+
+    Raises:
+        InputError: another process works there; ``refusal`` says so.
+    """
+    lock = FileLock(folder / LOCK_FILE, timeout=LOCK_TIMEOUT_S)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InputError(refusal) from None
+    try:
+        yield
     finally:
         lock.release()
 

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import h5py  # noqa: F401 - Minari asks for it only when it writes
 import numpy as np
-from filelock import FileLock, Timeout
 from minari import EpisodeData, MinariDataset, __version__
 from minari.data_collector.episode_buffer import EpisodeBuffer
 from minari.dataset.minari_dataset import DATASET_ID_RE
@@ -22,7 +21,7 @@ from minari.storage import get_dataset_path
 from tint_sumo import __version__ as own_version
 from tint_sumo.config import EpisodesSeed, Fraction
 from tint_sumo.core.errors import InputError, shown
-from tint_sumo.core.files import LOCK_FILE, LOCK_TIMEOUT_S, require_output_folder, write_json
+from tint_sumo.core.files import locked, require_output_folder, write_json
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.core.provenance import PACKAGES, commit, versions
@@ -234,25 +233,20 @@ def _whole_dataset(name: str, root: Path) -> Iterator[Path]:
     """
     partial, target = root / f".{name.replace('/', '.')}.partial", root / name
     partial.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(partial / LOCK_FILE, timeout=LOCK_TIMEOUT_S)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise InputError(f"another process records {target}; wait for it, or give another name as `minari`") from None
-    try:
-        data = partial / _DATA
-        shutil.rmtree(data, ignore_errors=True)
-        data.mkdir()
-        yield data
-        for namespace in reversed(target.parents[: name.count("/")]):
-            namespace.mkdir(exist_ok=True)
-            if not (namespace / NAMESPACE_METADATA_FILENAME).exists():
-                write_json(namespace / NAMESPACE_METADATA_FILENAME, {})
-        target.mkdir()
-        data.rename(target / _DATA)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        lock.release()
+    with locked(partial, f"another process records {target}; wait for it, or give another name as `minari`"):
+        try:
+            data = partial / _DATA
+            shutil.rmtree(data, ignore_errors=True)
+            data.mkdir()
+            yield data
+            for namespace in reversed(target.parents[: name.count("/")]):
+                namespace.mkdir(exist_ok=True)
+                if not (namespace / NAMESPACE_METADATA_FILENAME).exists():
+                    write_json(namespace / NAMESPACE_METADATA_FILENAME, {})
+            target.mkdir()
+            data.rename(target / _DATA)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
 
 
 def _metadata(episodes: PolicyEpisodes, given: Credits, outcomes: Counter[str]) -> dict[str, Any]:

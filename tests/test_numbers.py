@@ -410,22 +410,22 @@ def test_the_numbers_of_the_planner_are_those_of_its_cases(p_conservative: float
     numbers = [len(cases), finished.sum(), in_ceiling.sum(), found[between].sum(), between.sum()]
     assert [searched[finished].sum(), searched[~in_ceiling].sum()] == [8, 8]
     assert found[finished & searched].all() and not found[~in_ceiling].any()
-    told = (
+    sentence = (
         rf"(\d+) cases at P {p_conservative:g} the oracle finishes (\d+) and the ceiling has (\d+), and "
         r"in (\d+) of the (\d+) cases between"
     )
-    match = re.search(told, _prose("docs/results/index.md"))
+    match = re.search(sentence, _prose("docs/results/index.md"))
     assert match is not None and [int(number) for number in match.groups()] == numbers
 
 
 def test_the_numbers_of_adaptation_are_those_of_the_results() -> None:
     page = (DOCS / "explanation" / "strangers.md").read_text()
     (words,) = re.findall(r"### Getting to know a town\n(.*?)\n## ", page, re.DOTALL)
-    told = [float(number) for number in re.findall(r"\d\d\.\d", words)]
+    stated = [float(number) for number in re.findall(r"\d\d\.\d", words)]
     measured = pandas.read_csv(RESULTS / "adaptation.csv").groupby("kind", sort=False)["accuracy"].apply(list)
     first, _, last = measured["long"]
     expected = [first, last, *measured["remembers"], *measured["forgets"]]
-    assert told == [round(100 * accuracy, 1) for accuracy in expected]
+    assert stated == [round(100 * accuracy, 1) for accuracy in expected]
 
 
 def test_the_table_of_policies_among_strangers_is_that_of_the_results() -> None:

@@ -16,7 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from tint_sumo.config import ALL_MIXES, HELD_OUT_WORLDS, P_CONSERVATIVE, Mix
+from tint_sumo.config import ALL_MIXES, HELD_OUT_WORLDS, P_CONSERVATIVE, PPO_BUDGETS, Mix
 from tint_sumo.core.determinism import single_threaded
 from tint_sumo.core.errors import InputError, find_named, shown
 from tint_sumo.core.files import write_frame
@@ -34,7 +34,7 @@ from tint_sumo.scenes import paper_scene
 
 STRANGERS_SET = 600  # case set of tests among strangers
 LETTERS = {outcome[0]: outcome for outcome in BUILT_IN_OUTCOMES}  # of outcomes in the leaderboard
-_DECISION_STEPS = 4  # simulation steps per decision, as in the study
+_DECISION_STEPS = PPO_BUDGETS["full"].action_repeat  # simulation steps per decision, as in the study
 
 Function = Callable[[dict[str, NDArray[np.float32]]], Any]
 
@@ -219,13 +219,12 @@ def repeat(entries: Sequence[Entry], cases: int) -> pd.DataFrame:
         name, suite, world, cases (repeated), same (of them).
     """
     rows = []
-    with single_threaded():
-        for one in entries:
-            (trial,) = (trial for trial in SUITES[one.suite].trials if trial.name == one.world)
-            count = min(cases, len(one.outcomes))
-            again = evaluate(find_entry(one.entry), replace(SUITES[one.suite], trials=(trial,)), cases=count)
-            same = sum(a == b for a, b in zip(again.letters()[one.world], one.outcomes, strict=False))
-            rows.append({"name": one.name, "suite": one.suite, "world": one.world, "cases": count, "same": same})
+    for one in entries:
+        (trial,) = (trial for trial in SUITES[one.suite].trials if trial.name == one.world)
+        count = min(cases, len(one.outcomes))
+        again = evaluate(find_entry(one.entry), replace(SUITES[one.suite], trials=(trial,)), cases=count)
+        same = sum(a == b for a, b in zip(again.letters()[one.world], one.outcomes, strict=False))
+        rows.append({"name": one.name, "suite": one.suite, "world": one.world, "cases": count, "same": same})
     return pd.DataFrame(rows)
 
 

@@ -38,12 +38,17 @@ def finishable(p_conservative: Mix, episodes: int, case_set: int = 0, scene: Sce
         for first in range(0, episodes, simulation.replicas):
             count = min(simulation.replicas, episodes - first)
             for replica in range(count):
-                rng, _ = seeding.np_random(case_seed(case_set, first + replica))
-                simulation.reset(replica, episode_seed(rng, played.population.episodes_per_town))
+                simulation.reset(replica, traffic_seed(played, case_set, first + replica))
             finished.append(_finishes(simulation)[:count])
     finally:
         simulation.close()
     return np.concatenate(finished)
+
+
+def traffic_seed(scene: Scene, case_set: int, case: int) -> int:
+    """Return the seed of the traffic of a case, as environments draw it from the case's own seed."""
+    rng, _ = seeding.np_random(case_seed(case_set, case))
+    return episode_seed(rng, scene.population.episodes_per_town)
 
 
 def _finishes(simulation: SceneSimulation) -> NDArray[np.bool_]:

@@ -17,7 +17,7 @@ from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.envs.worlds import find_world
 from tint_sumo.methods.registry import METHODS, look_of
 from tint_sumo.study.jobs import smoothed_percent
-from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, by_world, varied
+from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, by_world, marker_offset, varied
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
 INK = {"success": "white", "timeout": "black", "collision": "white"}  # colours of the numbers on these colours
@@ -139,7 +139,7 @@ def plot_worlds(rows: Sequence[Summary], file: Path) -> Path:
     all_axes = figure.subplots(1, 2, sharey=True)
     for axes, outcome in zip(all_axes, ("success", "collision"), strict=True):
         for position, found in enumerate(methods.values()):
-            shift = 0.0 if len(methods) == 1 else 0.32 * (2 * position / (len(methods) - 1) - 1)
+            shift = marker_offset(position, len(methods), 0.32)
             heights = [list(worlds).index(str(row.conditions.world)) + shift for row in found]
             rates = np.array([100.0 * row.rate(outcome) for row in found])
             limits = 100.0 * np.array([row.intervals[outcome] for row in found]).T

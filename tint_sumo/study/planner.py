@@ -6,16 +6,15 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
-from tint_sumo.envs.episodes import Episodes, episode_seed
+from tint_sumo.envs.episodes import Episodes
 from tint_sumo.envs.rows import GOING_ON, outcome_name
-from tint_sumo.methods.evaluation import case_seed
 from tint_sumo.scenes import Scene
 from tint_sumo.scenes.layout import layout
+from tint_sumo.study.ceiling import traffic_seed
 
 _BATCH = 128  # plans that are tried at a time
 _FIRST_WAITS_M = (np.inf, 1.0)  # before the first lane; infinitely far is where the ego starts
@@ -83,11 +82,9 @@ class _Search:
             raise InputError("the planner knows scenes in which the ego's way meets two lanes")
         self._enter_m = np.sort(layout(scene).zones.enter_m)
         self._episodes = Episodes(_BATCH, [task])
-        self._decision_s = task.steps_per_decision * scene.step_s
-        self._times_s = self._decision_s * np.arange(task.decisions_per_episode)
+        self._times_s = task.steps_per_decision * scene.step_s * np.arange(task.decisions_per_episode)
         self._fastest = int(np.argmax(scene.ego.controller.desired_speeds_mps))
-        rng, _ = seeding.np_random(case_seed(case_set, case))
-        self._seed = episode_seed(rng, scene.population.episodes_per_town)
+        self._seed = traffic_seed(scene, case_set, case)
 
     def close(self) -> None:
         self._episodes.simulation.close()

@@ -230,6 +230,11 @@ def scores(rows: Sequence[Row]) -> dict[str, Scores]:
     return {title: np.stack([found[task] for task in common], axis=1) for title, found in by_task.items() if common}
 
 
+def marker_offset(position: int, count: int, most: float) -> float:
+    """Return how far from its line one of several markers is drawn, so that they stand side by side; up to ``most``."""
+    return 0.0 if count == 1 else most * (2 * position / (count - 1) - 1)
+
+
 def varied(rows: Sequence[AnyRow], name: str) -> dict[float, AnyRow]:
     """Return the rows that differ from the training in at most one condition, by its values in their order."""
     base = Conditions(rows[0].conditions.p_conservative)

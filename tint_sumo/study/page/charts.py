@@ -11,7 +11,7 @@ from tint_sumo.core.percentages import percent
 from tint_sumo.envs.worlds import find_world
 from tint_sumo.methods.registry import METHODS, Look, look_of
 from tint_sumo.study.jobs import smoothed_percent
-from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, by_world, varied
+from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, by_world, marker_offset, varied
 from tint_sumo.study.tables import Lines
 
 # Plotly's names for Matplotlib's markers and line styles.
@@ -24,6 +24,7 @@ _DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
 # Mixes are no methods: all have the same colour, and different markers.
 _MIX_COLOUR, _MIX_MARKERS = "#70757a", "oD^sv*PXh"
 _ROW_PX = 46  # height of a method's row
+_MOST_OFFSET = 0.3  # of a marker from its row, in rows
 _CURVE_LINES = 10  # rows of the table of learning curves
 
 
@@ -42,7 +43,7 @@ def outcome_chart(rows: Sequence[Summary], outcome: str) -> Chart:
     traces, lines = [], [["method", "P(conservative)", f"{outcome} %", "95 % interval"]]
     for position, mix in enumerate(mixes):
         shown_rows = [row for row in rows if row.conditions.p_conservative == mix]
-        shift = 0.0 if len(mixes) == 1 else 0.3 * (2 * position / (len(mixes) - 1) - 1)
+        shift = marker_offset(position, len(mixes), _MOST_OFFSET)
         shares, limits = _rates(shown_rows, outcome)
         heights = [titles.index(row.title) + shift for row in shown_rows]
         look = Look(_MIX_COLOUR, _MIX_MARKERS[position % len(_MIX_MARKERS)])
@@ -122,7 +123,7 @@ def world_chart(rows: Sequence[Summary], outcome: str) -> Chart:
     names = [find_world(world).title for world in worlds]
     traces, lines = [], [["world", "method", f"{outcome} %", "95 % interval"]]
     for position, (title, shown_rows) in enumerate(methods.items()):
-        shift = 0.0 if len(methods) == 1 else 0.3 * (2 * position / (len(methods) - 1) - 1)
+        shift = marker_offset(position, len(methods), _MOST_OFFSET)
         shares, limits = _rates(shown_rows, outcome)
         heights = [list(worlds).index(str(row.conditions.world)) + shift for row in shown_rows]
         line = _marks(shares, heights, title, look_of(shown_rows[0].method), is_open=shown_rows[0].is_shipped)

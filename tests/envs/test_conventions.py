@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
@@ -24,7 +25,7 @@ from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.scenes import T_INTERSECTION
 
 ENV_ID = ENV_IDS[T_INTERSECTION]
-GO = 2
+STOP, CREEP, GO = 0, 1, 2
 
 
 @pytest.mark.parametrize("env_id", [*ENV_IDS.values(), SCENE_ENV_ID])
@@ -174,7 +175,8 @@ def test_torchrl_sees_the_same_episodes() -> None:
     ):
         check_env_specs(theirs)
         theirs.set_seed(4)
-        rollout = theirs.rollout(40, break_when_any_done=False)
+        always = torch.tensor([GO, STOP, CREEP])  # so that one episode ends in a collision, and others by time limit
+        rollout = theirs.rollout(40, lambda tensordict: tensordict.set("action", always), break_when_any_done=False)
         ours.reset(seed=4)  # as TorchRL does to set a seed, before it begins
         observations, _ = ours.reset()
         for step, actions in enumerate(rollout["action"].T.numpy()):

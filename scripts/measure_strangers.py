@@ -1,10 +1,11 @@
-"""Test policies in worlds that their training has not met; writes a table.
+"""Test policies in worlds that their training has not met; writes tables.
 
-Usage: python scripts/measure_strangers.py RUNS [--cases 200] [--out data/results/strangers.csv] [--ship]
+Usage: python scripts/measure_strangers.py [RUNS] [--cases 200] [--out data/results/strangers.csv] [--ship]
 
 RUNS is a folder of training runs METHOD.SEED, such as ``tint-sumo policy train --method oracle --world strangers
 --budget strangers --seed 0 --out RUNS/oracle.0`` makes. A row of the table is a policy in a world; the rules and the
-shipped policies of the old world stand there, too. Rows that an earlier, interrupted call has written are kept.
+shipped policies of the old world stand there, too. Rows that an earlier, interrupted call has written are kept. Beside
+the table stand its means by method and world, and its scores by method, as Markdown; without RUNS these are remade.
 With --ship, data/models/policies/strangers gets the policy of each method's first seed; its card has the rates of all.
 """
 
@@ -17,14 +18,24 @@ from pathlib import Path
 import pandas
 
 from tint_sumo.benchmark import evaluate, worlds_suite
-from tint_sumo.core.files import write_frame, write_json
-from tint_sumo.methods.evaluation import BUILT_IN_OUTCOMES
+from tint_sumo.core.files import write_frame, write_json, write_text
+from tint_sumo.core.statistics import (
+    Scores,
+    improvement,
+    improvement_interval,
+    interquartile_interval,
+    interquartile_mean,
+)
+from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.study.budgets import STRANGERS_TESTS
+from tint_sumo.study.tables import Lines, markdown_table
 
 OTHERS = ("ttc", "no_labels", "oracle")  # a rule, and policies of the old world
 TRAINED_IN = "strangers"
+REFERENCE = "no_labels"  # that other methods are compared with
+CAREFUL = 0.01  # share of collisions that is the goal
 SHIPPED = Path(__file__).resolve().parents[1] / "data" / "models" / "policies" / TRAINED_IN
 FIELDS = ("trained_in", "method", "seed", "world", "cases", *(f"{outcome}_percent" for outcome in BUILT_IN_OUTCOMES))
 
@@ -41,6 +52,90 @@ def contenders(runs: Path) -> Iterator[tuple[str, str, str]]:
 def measure(name: str, world: str, cases: int) -> dict[str, str]:
     found = evaluate(name, worlds_suite(world, [world]), cases=cases).evaluations[world]
     return {f"{outcome}_percent": f"{100 * found.rate(outcome).value:.1f}" for outcome in BUILT_IN_OUTCOMES}
+
+
+def measure_all(runs: Path, cases: int, out: Path) -> list[dict[str, str]]:
+    """Return the rows of all policies, and write them to ``out`` as they come; those that it has already are kept."""
+    rows = list(csv.DictReader(out.read_text().splitlines())) if out.exists() else []
+    known = {(row["trained_in"], row["method"], row["seed"], row["world"], row["cases"]) for row in rows}
+    for trained_in, method, name in contenders(runs):
+        for world in STRANGERS_TESTS:
+            key = (trained_in, method, Path(name).suffix[1:], world, str(cases))
+            if key not in known:
+                rows.append(dict(zip(FIELDS, key, strict=False)) | measure(name, world, cases))
+                print(*rows[-1].values(), flush=True)
+                write_frame(pandas.DataFrame(rows), out)
+    print(f"wrote {out}")
+    return rows
+
+
+def titled(trained_in: str, method: str) -> str:
+    return f"{method}, old" if trained_in == "old" else method
+
+
+def worlds_lines(table: pandas.DataFrame) -> Lines:
+    """Return success / timeout / collision in percent of each method in each world, mean over its seeds."""
+    contenders = list(dict.fromkeys(zip(table["trained_in"], table["method"], strict=True)))
+    lines = [["world", *(titled(*contender) for contender in contenders)]]
+    for world in STRANGERS_TESTS:
+        cells = []
+        for trained_in, method in contenders:
+            found = table[(table["trained_in"] == trained_in) & (table["method"] == method) & (table["world"] == world)]
+            cells.append("/".join(f"{found[f'{outcome}_percent'].mean():.0f}" for outcome in BUILT_IN_OUTCOMES))
+        lines.append([f"`{world}`", *cells])
+    return lines
+
+
+def scores_lines(table: pandas.DataFrame) -> Lines:
+    """Return what the trainings of each method have reached over all worlds, seed by seed, in percent."""
+    trained = table[table["trained_in"] == TRAINED_IN]
+    success = {method: _by_seed(found, "success") for method, found in trained.groupby("method", sort=False)}
+    lines = [
+        [
+            "method",
+            "interquartile mean",
+            "success by seed",
+            "collisions by seed",
+            "worlds at most 1 %",
+            "above no_labels",
+        ]
+    ]
+    for method, scores in success.items():
+        collisions = _by_seed(trained[trained["method"] == method], "collision")
+        above = "-"
+        if method != REFERENCE and len(success[REFERENCE]):
+            above = _with_ends(
+                improvement(scores, success[REFERENCE]), improvement_interval(scores, success[REFERENCE])
+            )
+        lines.append(
+            [
+                f"`{method}`",
+                _with_ends(interquartile_mean(scores), interquartile_interval(scores)),
+                ", ".join(f"{100 * score:.0f}" for score in scores.mean(axis=1)),
+                ", ".join(f"{100 * score:.1f}" for score in collisions.mean(axis=1)),
+                ", ".join(str(count) for count in (collisions <= CAREFUL).sum(axis=1)),
+                above,
+            ]
+        )
+    return lines
+
+
+def _by_seed(table: pandas.DataFrame, outcome: str) -> Scores:
+    """Return the share of an outcome, (seeds, worlds)."""
+    return table.pivot(index="seed", columns="world", values=f"{outcome}_percent").to_numpy() / 100.0
+
+
+def _with_ends(value: float, ends: tuple[float, float]) -> str:
+    low, high = ends
+    return f"{100 * value:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def write_tables(file: Path) -> None:
+    """Write the Markdown tables that follow from a table of all policies, beside it."""
+    table = pandas.read_csv(file, keep_default_na=False, dtype={"seed": str})
+    target = file.with_suffix(".md")
+    write_text(target, f"{markdown_table(worlds_lines(table))}\n\n{markdown_table(scores_lines(table))}\n")
+    print(f"wrote {target}")
 
 
 def ship(runs: Path, rows: Sequence[Mapping[str, str]]) -> None:
@@ -66,25 +161,16 @@ def ship(runs: Path, rows: Sequence[Mapping[str, str]]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("runs", type=Path)
+    parser.add_argument("runs", type=Path, nargs="?")
     parser.add_argument("--cases", type=int, default=200)
     parser.add_argument("--out", type=Path, default=Path("data/results/strangers.csv"))
     parser.add_argument("--ship", action="store_true")
     given = parser.parse_args()
-    rows = list(csv.DictReader(given.out.read_text().splitlines())) if given.out.exists() else []
-    known = {(row["trained_in"], row["method"], row["seed"], row["world"], row["cases"]) for row in rows}
-    for trained_in, method, name in contenders(given.runs):
-        for world in STRANGERS_TESTS:
-            seed = Path(name).suffix[1:]
-            key = (trained_in, method, seed, world, str(given.cases))
-            if key in known:
-                continue
-            rows.append(dict(zip(FIELDS, key, strict=False)) | measure(name, world, given.cases))
-            print(*rows[-1].values(), flush=True)
-            write_frame(pandas.DataFrame(rows), given.out)
-    print(f"wrote {given.out}")
-    if given.ship:
-        ship(given.runs, rows)
+    if given.runs is not None:
+        rows = measure_all(given.runs, given.cases, given.out)
+        if given.ship:
+            ship(given.runs, rows)
+    write_tables(given.out)
 
 
 if __name__ == "__main__":

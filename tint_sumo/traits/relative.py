@@ -305,7 +305,8 @@ def _from_others(everybody: Floats, total: Floats, count: float, latent: Floats)
     others = everybody[1] - weight
     if others < _LEAST_WEIGHT:
         return 0.0
-    return min(max(x - (everybody[0] - weight * x) / others, -_FARTHEST), _FARTHEST)
+    difference: float = x - (everybody[0] - weight * x) / others
+    return min(max(difference, -_FARTHEST), _FARTHEST)
 
 
 @compiled

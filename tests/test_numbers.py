@@ -446,3 +446,18 @@ def test_the_table_of_policies_among_strangers_is_that_of_the_results() -> None:
         for key, cell in zip(columns, cells, strict=True):
             row = found.loc[(world.strip("`"), *key)]
             assert cell == "/".join(f"{row[f'{outcome}_percent']:.0f}" for outcome in BUILT_IN_OUTCOMES)
+
+
+def test_the_profile_of_trainings_is_that_of_the_results() -> None:
+    (table,) = (one for one in _tables(DOCS / "explanation" / "training.md") if "SUMO's step" in one)
+    _, _, *lines = table.strip().split("\n")
+    measured = pandas.read_csv(RESULTS / "training_profile.csv").groupby("part", sort=False)
+    stated = [line.strip("| ").split(" | ") for line in lines]
+    assert stated == [
+        [part, *(f"{row.cpu_us_per_decision:.0f} µs ({row.share_percent:.0f} %)" for row in rows.itertuples())]
+        for part, rows in measured
+    ]
+    share = measured.get_group("update")["share_percent"].iloc[0] / 100
+    page = _prose("docs/explanation/training.md")
+    assert f"learning is {100 * share:.0f} % of a training" in page
+    assert f"by a factor of {1 / (1 - share):.2f} only" in page

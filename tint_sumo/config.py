@@ -711,6 +711,7 @@ class PpoSettings:
     motion: bool = False  # whether the policy observes each vehicle's speed, too, as its track shows it
     relative: RelativeSettings = field(default_factory=RelativeSettings)  # of the method "relative"
     time_limit_s: TimeS = 50.0  # limit of training episodes if the scene's is not shorter; evaluation has the scene's
+    calibration_episodes: Annotated[int, Range(0, 1_000_000)] = 0  # to find how readily the trained policy should move
 
     def __post_init__(self) -> None:
         require_ranges(self)
@@ -770,7 +771,7 @@ _FULL_PPO = PpoSettings(
 PPO_BUDGETS = {
     "quick": replace(_FULL_PPO, n_envs=64, total_steps=200_000),
     "full": _FULL_PPO,
-    "strangers": replace(_FULL_PPO, reward="careful", motion=True, n_epochs=8),
+    "strangers": replace(_FULL_PPO, reward="careful", motion=True, n_epochs=8, calibration_episodes=512),
     "paper": PpoSettings(),
 }
 

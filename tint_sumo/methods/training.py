@@ -6,7 +6,8 @@ import io
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from contextlib import closing
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from tint_sumo.core.structures import plain
 from tint_sumo.core.training_log import log_film, open_log
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.rows import outcomes_in
+from tint_sumo.methods.calibration import Calibration, calibrate
 from tint_sumo.methods.checkpoint import make_checkpoint, restore_checkpoint
 from tint_sumo.methods.evaluation import CASE_SEED
 from tint_sumo.methods.registry import Learned, find_learned
@@ -149,12 +151,16 @@ def train_policy(
             if encoder is not None:
                 save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)).entries)
             card = _card(identity, encoder)
-            venv = training_venv(learned, encoder, p_conservative, settings, scenes, sensors)
-            try:
-                with preserved_random_state(), single_threaded():
+
+            def make_venv(num_envs: int) -> VecEnv:
+                some = replace(settings, n_envs=num_envs)
+                return training_venv(learned, encoder, p_conservative, some, scenes, sensors)
+
+            with preserved_random_state(), single_threaded():
+                with closing(make_venv(settings.n_envs)) as venv:
                     model = _learn(venv, outcomes_in(scenes[0]), steps, seed, out, settings, card, film, report)
-            finally:
-                venv.close()
+                if settings.calibration_episodes:
+                    card |= {"calibration": asdict(calibrated(model.policy, make_venv, seed, settings, report))}
             if with_zip:
                 model.save(out / ZIP_FILE)
             save_policy(model.policy, stem, card)
@@ -262,6 +268,14 @@ def _learn(
             watch.write_checkpoint()
             raise DivergedError(f"{error}; the checkpoint in {out} holds the last finite policy") from None
     return model
+
+
+def calibrated(
+    policy: GruPolicy, make_venv: Callable[[int], VecEnv], seed: int, settings: PpoSettings, report: Report = silent
+) -> Calibration:
+    """Calibrate a policy at the end of its training, in episodes that the training has not had."""
+    first_seed = CASE_SEED // 2 + _training_seed(seed) // 2
+    return calibrate(policy, make_venv, first_seed, settings.calibration_episodes, settings.n_envs, report)
 
 
 def _log_film(model: BaseAlgorithm, stem: Path, film: FilmMaker | None) -> None:

@@ -86,7 +86,7 @@ def test_each_method_gets_its_traits_from_its_own_source(name: str, kind: type) 
     source, another = method.make_source(encoder, PPO), method.make_source(encoder, PPO)
     assert type(source) is kind
     assert source is not another
-    assert source.size == {StreamingTraits: 5, NeighbourTraits: 3}.get(kind, LATENT_SIZE)
+    assert source.size == (5 if kind is StreamingTraits else LATENT_SIZE)
 
 
 def test_ablations_differ_from_their_methods_in_one_thing() -> None:

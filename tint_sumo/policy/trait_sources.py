@@ -255,7 +255,7 @@ class StreamingTraits(TraitSource):
 class NeighbourTraits(TraitSource):
     """Traits inferred from how a vehicle and all others in the episode follow their leaders.
 
-    A vehicle's three numbers are those of ``tint_sumo.traits.relative.RelativeStream``.
+    A vehicle's two numbers are those of ``tint_sumo.traits.relative.RelativeStream``.
     """
 
     size = LATENTS

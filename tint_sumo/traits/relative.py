@@ -12,9 +12,6 @@ a town is a probability for each T, D and share of the first group on a grid; ea
 rule. From it and the driver's x follows the probability that a driver is of the first group. So a driver who keeps
 longer gaps than its neighbours is known to yield only where the neighbours show that there are two groups.
 
-The belief is only as good as this model of a town. So a driver has the plain difference of its x from the others'
-weighted mean, too: with both a policy learns more than with either of them.
-
 The weights of x, the distributions of T and D among towns, s and k are fitted to traffic without labels
 (``tint_sumo.traits.relative_fit``).
 """
@@ -30,7 +27,7 @@ from tint_sumo.config import NO_LEADER_GAP_M, STEP_S, RelativeLatent, RelativeSe
 from tint_sumo.core.compiling import compiled
 
 STATISTICS = 2  # time gap in s and gap in m
-LATENTS = 3  # numbers of a driver: its belief, how much of what can be known of it is known, how far it is from others
+LATENTS = 2  # numbers of a driver: its belief, and how much of what can be known of it is known
 SHARES = (0.2, 0.5, 0.8)  # of the first group, each as likely as the others
 GRID = 0.3  # distance of the values of T, and half that of D
 TOWNS = 29  # values of T, up to 4.2 from the mean of all towns
@@ -40,9 +37,6 @@ _FAST, _SLOW = 0.3, 0.2  # weights of the newest step in two moving averages
 _LAG_S = (1.0 / _SLOW - 1.0 / _FAST) * STEP_S  # by which the second is older than the first
 _FIRST_STEPS = 3  # of a track, too few for averages
 _NEW_LEADER_M = 3.0  # the gap jumps by more where the leader changes
-_HALF_WEIGHT_STEPS = 20.0  # a driver with so many steady steps has half the weight of one with very many
-_LEAST_WEIGHT = 0.04  # of all others; one steady step has more
-_FARTHEST = 3.0  # that a driver's x counts as being from the others'
 _NO_LEADER_GAP_M, _STEP_S = NO_LEADER_GAP_M, STEP_S
 
 Floats = NDArray[np.float64]
@@ -59,9 +53,8 @@ class _Memory:
     total: Floats  # (N, V, 2) sums of time gap and gap over the steady steps of the track
     count: Floats  # (N, V) number of these steps
     town: Floats  # (N, 3, 7, 29) belief about shares, D and T after all tracks that have ended
-    left: Floats  # (N, 2) sums over all tracks that have ended, of weight times x and of weights
     step: NDArray[np.int64]  # (N,) since the episode's first
-    traits: NDArray[np.float32]  # (N, V, 3) of the present vehicles
+    traits: NDArray[np.float32]  # (N, V, 2) of the present vehicles
 
     @classmethod
     def empty(cls, num_envs: int, slots: int, shape_of_belief: tuple[int, ...]) -> Self:
@@ -74,7 +67,6 @@ class _Memory:
             np.zeros((*shape, STATISTICS)),
             np.zeros(shape),
             np.zeros((num_envs, *shape_of_belief)),
-            np.zeros((num_envs, 2)),
             np.zeros(num_envs, np.int64),
             np.zeros((*shape, LATENTS), np.float32),
         )
@@ -122,7 +114,6 @@ class RelativeStream:
         """Forget the episodes of some environments."""
         self._memory.seen[envs] = False
         self._memory.town[envs] = self._prior
-        self._memory.left[envs] = 0.0
         self._memory.step[envs] = 0
 
     def advance(
@@ -131,19 +122,18 @@ class RelativeStream:
         """Take one step in K environments; arrays are (K, V), and a slot stays empty for a step between two tracks.
 
         Returns:
-            Three numbers of each driver, (K, V, 3), inferred anew every five steps: its belief, from -1, which surely
-            does not yield, to 1, which surely does; n / (n + k), 0 at first; and by how much its x exceeds the
-            weighted mean over all other drivers of the episode, from -3 to 3. All are 0 in empty slots.
+            Two numbers of each driver, (K, V, 2), inferred anew every five steps: its belief, from -1, which surely
+            does not yield, to 1, which surely does, and n / (n + k), 0 at first. Both are 0 in empty slots.
         """
         m = self._memory
         _observe(
             envs, present, position_m, gap_m, self._limits, self._latent,
-            m.seen, m.steps, m.leader_steps, m.motion, m.total, m.count, m.town, m.left,
+            m.seen, m.steps, m.leader_steps, m.motion, m.total, m.count, m.town,
         )  # fmt: skip
         m.traits[envs] *= m.seen[envs][..., None]
         due = envs[m.step[envs] % _EVERY_STEPS == 0]
         if len(due):
-            _infer(due, self._latent, m.seen, m.total, m.count, m.town, m.left, m.traits)
+            _infer(due, self._latent, m.seen, m.total, m.count, m.town, m.traits)
         m.step[envs] += 1
         return np.asarray(m.traits[envs])
 
@@ -188,7 +178,6 @@ def _observe(
     total: Floats,
     count: Floats,
     town: Floats,
-    left: Floats,
 ) -> None:
     """Add one step to all tracks of some environments; the last arguments are those of ``_Memory``."""
     least_speed, most_accel, farthest_leader, most_closing = limits
@@ -198,7 +187,6 @@ def _observe(
             if not present[row, slot]:
                 if seen[track] and count[track] > 0:
                     learn(town[env], densities(total[track], count[track], latent, town.shape[2]))
-                    _add(left[env], total[track], count[track], latent)
                 seen[track] = False
                 continue
             state, gap = motion[env, slot], min(gap_m[row, slot], _NO_LEADER_GAP_M)
@@ -224,12 +212,6 @@ def _observe(
 
 
 @compiled
-def _above_all_towns(total: Floats, count: float, latent: Floats) -> float:
-    """Return by how much a driver's x exceeds the mean of all towns."""
-    return float((latent[0] * total[0] + latent[1] * total[1]) / count - latent[2])
-
-
-@compiled
 def densities(total: Floats, count: float, latent: Floats, differences: int) -> Floats:
     """Return the density of a driver's x around each mean that a group can have, on the grid.
 
@@ -239,7 +221,7 @@ def densities(total: Floats, count: float, latent: Floats, differences: int) -> 
         latent: numbers of the latent.
         differences: number of values of D.
     """
-    x = _above_all_towns(total, count, latent)
+    x = (latent[0] * total[0] + latent[1] * total[1]) / count - latent[2]
     size = TOWNS + 2 * (differences - 1)
     std = latent[3] * np.sqrt(1.0 + latent[4] / count)
     x = min(max(x, -0.5 * GRID * (size - 1)), 0.5 * GRID * (size - 1))
@@ -289,27 +271,6 @@ def probability(town: Floats, density: Floats) -> float:
 
 
 @compiled
-def _add(sums: Floats, total: Floats, count: float, latent: Floats) -> None:
-    """Add a driver, who has steady steps, to sums (2,) of weight times x and of weights."""
-    weight = count / (count + _HALF_WEIGHT_STEPS)
-    sums[0] += weight * _above_all_towns(total, count, latent)
-    sums[1] += weight
-
-
-@compiled
-def _from_others(everybody: Floats, total: Floats, count: float, latent: Floats) -> float:
-    """Return by how much a driver's x exceeds the others' weighted mean; 0 where it or they have no steady step."""
-    if count == 0:
-        return 0.0
-    x, weight = _above_all_towns(total, count, latent), count / (count + _HALF_WEIGHT_STEPS)
-    others = everybody[1] - weight
-    if others < _LEAST_WEIGHT:
-        return 0.0
-    difference: float = x - (everybody[0] - weight * x) / others
-    return min(max(difference, -_FARTHEST), _FARTHEST)
-
-
-@compiled
 def _infer(
     envs: NDArray[np.int64],
     latent: Floats,
@@ -317,23 +278,20 @@ def _infer(
     total: Floats,
     count: Floats,
     town: Floats,
-    left: Floats,
     traits: NDArray[np.float32],
 ) -> None:
     """Write the traits of all drivers in some environments; see ``RelativeStream.advance``."""
     slots, differences = seen.shape[1], town.shape[2]
     density = np.ones((slots, TOWNS + 2 * (differences - 1)))
     for env in envs:
-        now, everybody = town[env].copy(), left[env].copy()
+        now = town[env].copy()
         for slot in range(slots):
             if seen[env, slot]:
                 density[slot] = 1.0
                 if count[env, slot] > 0:
                     density[slot] = densities(total[env, slot], count[env, slot], latent, differences)
                     learn(now, density[slot])
-                    _add(everybody, total[env, slot], count[env, slot], latent)
         for slot in range(slots):
             if seen[env, slot]:
                 traits[env, slot, 0] = 2.0 * probability(now, density[slot]) - 1.0
                 traits[env, slot, 1] = count[env, slot] / (count[env, slot] + latent[4])
-                traits[env, slot, 2] = _from_others(everybody, total[env, slot], count[env, slot], latent)

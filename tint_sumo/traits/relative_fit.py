@@ -50,7 +50,7 @@ def traffic(tasks: Sequence[TaskSettings], seed: int, *, steps: int = STEPS, num
 
 
 def follow(settings: RelativeSettings, seen: Perceived) -> tuple[NDArray[np.float32], Floats, Floats]:
-    """Return relative traits (T, N, V, 3) of all drivers in traffic, from what has been seen up to each step.
+    """Return relative traits (T, N, V, 2) of all drivers in traffic, from what has been seen up to each step.
 
     Then come the sums (T, N, V, 2) of time gap and gap over the steady steps of each track so far, and their number
     (T, N, V).

@@ -6,7 +6,8 @@ RUNS is a folder of training runs METHOD.SEED, such as ``tint-sumo policy train 
 --budget strangers --seed 0 --out RUNS/oracle.0`` makes. A row of the table is a policy in a world; the rules and the
 shipped policies of the old world stand there, too. Rows that an earlier, interrupted call has written are kept. Beside
 the table stand its means by method and world, and its scores by method, as Markdown; without RUNS these are remade.
-With --ship, data/models/policies/strangers gets the policy of each method's first seed; its card has the rates of all.
+With --ship, data/models/policies/strangers gets the policy of the first seed of each method that needs no trait model;
+its card has the rates of all seeds.
 """
 
 import argparse
@@ -27,6 +28,7 @@ from tint_sumo.core.statistics import (
     interquartile_mean,
 )
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
+from tint_sumo.methods.registry import find_learned
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.study.budgets import STRANGERS_TESTS
@@ -100,13 +102,12 @@ def scores_lines(table: pandas.DataFrame) -> Lines:
             "above no_labels",
         ]
     ]
+    reference = success.get(REFERENCE)
     for method, scores in success.items():
         collisions = _by_seed(trained[trained["method"] == method], "collision")
         above = "-"
-        if method != REFERENCE and len(success[REFERENCE]):
-            above = _with_ends(
-                improvement(scores, success[REFERENCE]), improvement_interval(scores, success[REFERENCE])
-            )
+        if reference is not None and method != REFERENCE:
+            above = _with_ends(improvement(scores, reference), improvement_interval(scores, reference))
         lines.append(
             [
                 f"`{method}`",
@@ -139,9 +140,9 @@ def write_tables(file: Path) -> None:
 
 
 def ship(runs: Path, rows: Sequence[Mapping[str, str]]) -> None:
-    """Copy the policy of each method's first seed, with the method's rates in each world."""
+    """Copy the policy of each method's first seed, with the method's rates; not those that need a trait model."""
     trained = [row for row in rows if row["trained_in"] == TRAINED_IN]
-    for method in dict.fromkeys(row["method"] for row in trained):
+    for method in dict.fromkeys(row["method"] for row in trained if find_learned(row["method"]).encoder is None):
         of_method = [row for row in trained if row["method"] == method]
         seeds = sorted({int(row["seed"]) for row in of_method})
         results = {}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas
 import pytest
+from scipy.stats import trim_mean
 
 from tint_sumo import traits
 from tint_sumo.cli import main
@@ -428,24 +429,31 @@ def test_the_numbers_of_adaptation_are_those_of_the_results() -> None:
     assert stated == [round(100 * accuracy, 1) for accuracy in expected]
 
 
-def test_the_table_of_policies_among_strangers_is_that_of_the_results() -> None:
-    (table,) = (one for one in _tables(DOCS / "explanation" / "strangers.md") if "`ttc`" in one)
-    head, _, *lines = table.strip().split("\n")
+def test_the_tables_of_policies_among_strangers_are_those_of_the_results() -> None:
+    worlds, scores = _tables(RESULTS / "strangers.md")
     measured = pandas.read_csv(RESULTS / "strangers.csv", keep_default_na=False, dtype={"seed": str})
-    found = measured.set_index(["world", "method", "seed", "trained_in"])
     assert set(measured["cases"]) == {200}
+    head, _, *lines = worlds.strip().split("\n")
     columns = []
-    for name in head.strip("| ").split(" | ")[1:]:
-        method, _, seed = (
-            name.replace("`", "").replace("no labels, old", "no_labels old").replace(",", "").partition(" ")
-        )
-        columns.append((method, "", "old") if seed == "old" else (method, seed, "strangers" if seed else ""))
-    assert len(lines) * len(columns) == len(measured)
+    for title in head.strip("| ").split(" | ")[1:]:
+        method, _, old = title.partition(", ")
+        columns.append((method, "old" if old else "" if method == "ttc" else "strangers"))
+    assert set(columns) == set(zip(measured["method"], measured["trained_in"], strict=True))
     for line in lines:
         world, *cells = line.strip("| ").split(" | ")
-        for key, cell in zip(columns, cells, strict=True):
-            row = found.loc[(world.strip("`"), *key)]
-            assert cell == "/".join(f"{row[f'{outcome}_percent']:.0f}" for outcome in BUILT_IN_OUTCOMES)
+        for (method, trained_in), cell in zip(columns, cells, strict=True):
+            chosen = (measured["method"] == method) & (measured["trained_in"] == trained_in)
+            found = measured[chosen & (measured["world"] == world.strip("`"))]
+            assert cell == "/".join(f"{found[f'{outcome}_percent'].mean():.0f}" for outcome in BUILT_IN_OUTCOMES)
+    trained = measured[measured["trained_in"] == "strangers"]
+    for line in scores.strip().split("\n")[2:]:
+        method, middle, success, collisions, careful, _ = line.strip("| ").split(" | ")
+        found = trained[trained["method"] == method.strip("`")]
+        assert float(middle.split()[0]) == pytest.approx(trim_mean(found["success_percent"], 0.25), abs=0.51)
+        seeds = [rows for _, rows in found.groupby("seed")]
+        assert success == ", ".join(f"{rows['success_percent'].mean():.0f}" for rows in seeds)
+        assert collisions == ", ".join(f"{rows['collision_percent'].mean():.1f}" for rows in seeds)
+        assert careful == ", ".join(str((rows["collision_percent"] <= 1.0).sum()) for rows in seeds)
 
 
 def test_the_profile_of_trainings_is_that_of_the_results() -> None:

@@ -78,7 +78,8 @@ def train_policy(
 
     Beside them stand the policies after 25 and 50 % of the training, the training's curve (outcomes of the last
     episodes by decisions), a TensorBoard log and, where the method infers traits, its trait model. An interrupted run
-    leaves a checkpoint, and the same call goes on from there. A finished run is not repeated.
+    leaves a checkpoint, and the same call goes on from there. A finished run is not repeated. With
+    ``calibration_episodes`` the trained policy is calibrated at the end (``tint_sumo.methods.calibration``).
 
     The policy follows from the arguments alone: the training computes in one thread, nobody who looks on changes its
     random numbers, and the process's own are as before when it ends.

@@ -20,6 +20,7 @@ import pandas
 
 from tint_sumo.benchmark import evaluate, worlds_suite
 from tint_sumo.core.files import write_frame, write_json, write_text
+from tint_sumo.core.percentages import percent_and_ends
 from tint_sumo.core.statistics import (
     Scores,
     improvement,
@@ -77,11 +78,11 @@ def titled(trained_in: str, method: str) -> str:
 
 def worlds_lines(table: pandas.DataFrame) -> Lines:
     """Return success / timeout / collision in percent of each method in each world, mean over its seeds."""
-    contenders = list(dict.fromkeys(zip(table["trained_in"], table["method"], strict=True)))
-    lines = [["world", *(titled(*contender) for contender in contenders)]]
+    columns = list(dict.fromkeys(zip(table["trained_in"], table["method"], strict=True)))
+    lines = [["world", *(titled(*column) for column in columns)]]
     for world in STRANGERS_TESTS:
         cells = []
-        for trained_in, method in contenders:
+        for trained_in, method in columns:
             found = table[(table["trained_in"] == trained_in) & (table["method"] == method) & (table["world"] == world)]
             cells.append("/".join(f"{found[f'{outcome}_percent'].mean():.0f}" for outcome in BUILT_IN_OUTCOMES))
         lines.append([f"`{world}`", *cells])
@@ -107,11 +108,11 @@ def scores_lines(table: pandas.DataFrame) -> Lines:
         collisions = _by_seed(trained[trained["method"] == method], "collision")
         above = "-"
         if reference is not None and method != REFERENCE:
-            above = _with_ends(improvement(scores, reference), improvement_interval(scores, reference))
+            above = percent_and_ends(improvement(scores, reference), improvement_interval(scores, reference), digits=0)
         lines.append(
             [
                 f"`{method}`",
-                _with_ends(interquartile_mean(scores), interquartile_interval(scores)),
+                percent_and_ends(interquartile_mean(scores), interquartile_interval(scores), digits=0),
                 ", ".join(f"{100 * score:.0f}" for score in scores.mean(axis=1)),
                 ", ".join(f"{100 * score:.1f}" for score in collisions.mean(axis=1)),
                 ", ".join(str(count) for count in (collisions <= CAREFUL).sum(axis=1)),
@@ -124,11 +125,6 @@ def scores_lines(table: pandas.DataFrame) -> Lines:
 def _by_seed(table: pandas.DataFrame, outcome: str) -> Scores:
     """Return the share of an outcome, (seeds, worlds)."""
     return table.pivot(index="seed", columns="world", values=f"{outcome}_percent").to_numpy() / 100.0
-
-
-def _with_ends(value: float, ends: tuple[float, float]) -> str:
-    low, high = ends
-    return f"{100 * value:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
 
 
 def write_tables(file: Path) -> None:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tint_sumo.core.percentages import percent
+from tint_sumo.core.percentages import percent, percent_and_ends
 
 
 @pytest.mark.parametrize(
@@ -36,3 +36,8 @@ def test_what_is_read_is_near_what_is_meant(total: int, data: st.DataObject, dig
     assert (words.strip("<>") == words) or 0 < count < total
     assert abs(float(words.strip("<>")) - 100 * count / total) <= 10.0**-digits
     assert (float(words) == 100) == (count == total) if not words.startswith((">", "<")) else True
+
+
+def test_the_ends_of_an_interval_are_rounded_as_its_share() -> None:
+    assert percent_and_ends(0.985, (0.97, 0.9996)) == "98.5 [97.0, >99.9]"
+    assert percent_and_ends(0.985, (0.0, 1.0), digits=0) == "99 [0, 100]"

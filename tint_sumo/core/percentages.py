@@ -24,3 +24,9 @@ def percent(share: float, digits: int = 1) -> str:
     if rounded <= 0 < exact:
         return f"<{unit}"
     return str(rounded)
+
+
+def percent_and_ends(share: float, ends: tuple[float, float], digits: int = 1) -> str:
+    """Return a share with the ends of its interval, all as ``percent`` has them: "98.5 [97.0, 99.2]"."""
+    low, high = ends
+    return f"{percent(share, digits)} [{percent(low, digits)}, {percent(high, digits)}]"

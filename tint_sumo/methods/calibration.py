@@ -23,10 +23,10 @@ BIASES = (0.0, 0.5, 1.0, 1.5, 2.0)  # that are tried
 
 @dataclass(frozen=True)
 class Calibration:
-    """What has been added to the logits of moving, and what each bias has earned."""
+    """Bias that was added to the logits of all actions but the slowest, and the mean return of each bias tried."""
 
     bias: float
-    returns: dict[str, float]  # mean reward of an episode by the bias tried
+    returns: dict[str, float]  # mean sum of rewards of an episode, by the bias
 
 
 def calibrate(

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tint_sumo.core.files import write_text
-from tint_sumo.core.percentages import percent
+from tint_sumo.core.percentages import percent, percent_and_ends
 from tint_sumo.core.statistics import (
-    Interval,
     Scores,
     difference_interval,
     improvement,
@@ -208,15 +207,12 @@ def _robust_lines(found: Mapping[str, Scores]) -> Lines:
         means = method_scores.mean(axis=1)
         chance = "-"
         if reference is not None and reference is not method_scores:
-            chance = _and_ends(improvement(method_scores, reference), improvement_interval(method_scores, reference))
-        middle = _and_ends(interquartile_mean(method_scores), interquartile_interval(method_scores))
+            chance = percent_and_ends(
+                improvement(method_scores, reference), improvement_interval(method_scores, reference)
+            )
+        middle = percent_and_ends(interquartile_mean(method_scores), interquartile_interval(method_scores))
         lines.append([title, str(len(means)), middle, percent(float(means.min())), percent(float(means.max())), chance])
     return lines
-
-
-def _and_ends(value: float, ends: Interval) -> str:
-    low, high = ends
-    return f"{percent(value)} [{percent(low)}, {percent(high)}]"
 
 
 def _condition_lines(rows: Sequence[Summary]) -> Lines:
@@ -254,4 +250,4 @@ def _with_spread(row: Summary) -> str:
 
 
 def _with_interval(row: Summary, outcome: str) -> str:
-    return _and_ends(row.rate(outcome), row.intervals[outcome])
+    return percent_and_ends(row.rate(outcome), row.intervals[outcome])

@@ -7,7 +7,7 @@ RUNS is a folder of training runs METHOD.SEED, such as ``tint-sumo policy train 
 shipped policies of the old world stand there, too. Rows that an earlier, interrupted call has written are kept. Beside
 the table stand its means by method and world, and its scores by method, as Markdown; without RUNS these are remade.
 With --ship, data/models/policies/strangers gets the policy of the first seed of each method that needs no trait model;
-its card has the rates of all seeds.
+its card has the rates of all seeds. RUNS may also hold policies of ``scripts/supervised.py``, the bound of inference.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pandas
+from supervised import METHOD, NETWORK_FILE, register_supervised
 
 from tint_sumo.benchmark import evaluate, worlds_suite
 from tint_sumo.core.files import write_frame, write_json, write_text
@@ -47,6 +48,8 @@ def contenders(runs: Path) -> Iterator[tuple[str, str, str]]:
     """Yield the world of the training, the name of the method, and name or path of each policy; with its seed last."""
     for name in OTHERS:
         yield "" if name == "ttc" else "old", name, name
+    if (runs / NETWORK_FILE).exists():
+        register_supervised(runs / NETWORK_FILE)
     for folder in sorted(runs.iterdir()):
         if (folder / "policy.safetensors").exists():
             yield TRAINED_IN, folder.name.split(".")[0], str(folder)
@@ -137,7 +140,7 @@ def write_tables(file: Path) -> None:
 
 def ship(runs: Path, rows: Sequence[Mapping[str, str]]) -> None:
     """Copy the policy of each method's first seed, with the method's rates; not those that need a trait model."""
-    trained = [row for row in rows if row["trained_in"] == TRAINED_IN]
+    trained = [row for row in rows if row["trained_in"] == TRAINED_IN and row["method"] != METHOD]
     for method in dict.fromkeys(row["method"] for row in trained if find_learned(row["method"]).encoder is None):
         of_method = [row for row in trained if row["method"] == method]
         seeds = sorted({int(row["seed"]) for row in of_method})

@@ -30,7 +30,7 @@ from tint_sumo.core.statistics import (
     interquartile_mean,
 )
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
-from tint_sumo.methods.registry import find_learned
+from tint_sumo.methods.registry import METHODS, find_learned
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
 from tint_sumo.study.budgets import STRANGERS_TESTS
@@ -70,9 +70,19 @@ def measure_all(runs: Path, cases: int, out: Path) -> list[dict[str, str]]:
             if key not in known:
                 rows.append(dict(zip(FIELDS, key, strict=False)) | measure(name, world, cases))
                 print(*rows[-1].values(), flush=True)
-                write_frame(pandas.DataFrame(rows), out)
+                write_frame(pandas.DataFrame(in_order(rows)), out)
     print(f"wrote {out}")
     return rows
+
+
+def in_order(rows: Sequence[dict[str, str]]) -> list[dict[str, str]]:
+    """Return rows with those trained among strangers last, methods in the registry's order, and seeds rising."""
+    methods = {name: number for number, name in enumerate(METHODS)}
+
+    def place(row: Mapping[str, str]) -> tuple[bool, int, int]:
+        return row["trained_in"] == TRAINED_IN, methods.get(row["method"], len(methods)), int(row["seed"] or 0)
+
+    return sorted(rows, key=place)
 
 
 def titled(trained_in: str, method: str) -> str:

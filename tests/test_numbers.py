@@ -429,6 +429,21 @@ def test_the_numbers_of_adaptation_are_those_of_the_results() -> None:
     assert stated == [round(100 * accuracy, 1) for accuracy in expected]
 
 
+def test_the_table_of_the_papers_recipe_is_that_of_its_cases() -> None:
+    (table,) = (one for one in _tables(DOCS / "explanation" / "paper.md") if "whole training" in one)
+    measured = pandas.read_csv(RESULTS / "paper_recipe.csv")
+    assert set(measured["cases"]) == {500}
+
+    def rates(row: pandas.Series, head: str = "") -> str:
+        return "/".join(f"{row[f'{head}{outcome}_percent']:.0f}" for outcome in BUILT_IN_OUTCOMES)
+
+    lines = [line.strip("| ").split(" | ") for line in table.strip().split("\n")[2:]]
+    for budget, (_, *cells) in zip(("paper", "full"), lines, strict=True):
+        rows = [row for _, row in measured[measured["budget"] == budget].iterrows()]
+        published = rates(rows[-1], "published_") if budget == "paper" else "-"
+        assert cells == [*(rates(row) for row in rows), published]
+
+
 def test_the_tables_of_policies_among_strangers_are_those_of_the_results() -> None:
     worlds, scores = _tables(RESULTS / "strangers.md")
     measured = pandas.read_csv(RESULTS / "strangers.csv", keep_default_na=False, dtype={"seed": str})

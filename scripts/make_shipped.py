@@ -54,6 +54,7 @@ WAITING_STEPS = 400
 DATA = Path(__file__).resolve().parents[1] / "data"
 IMAGES = DATA / "images"
 TRAINING_NOISE_M = {"cross_window": 0.05}  # of the shipped trait models that are trained with noise
+AMONG_STRANGERS = ("ttc", "no_labels", "vae", "relative", "supervised", "oracle")  # methods in the figure
 
 
 def run(*arguments: str) -> None:
@@ -130,8 +131,9 @@ def make_figures(images: Path) -> None:
 
 
 def rows_of_strangers() -> list[StoredRow]:
-    """Return the rows of ``strangers.csv``: a method's seeds in one, with intervals over all of their cases."""
+    """Return rows of ``strangers.csv`` for the figure: a method's seeds in one, with intervals over all cases."""
     table = pandas.read_csv(DATA / "results" / "strangers.csv", keep_default_na=False)
+    table = table[table["method"].isin(AMONG_STRANGERS)]
     table["is_trained"] = table["trained_in"] == "strangers"
     rows = []
     for (is_trained, method, world), found in table.groupby(["is_trained", "method", "world"], sort=False):

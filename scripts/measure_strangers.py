@@ -21,7 +21,7 @@ from supervised import METHOD, NETWORK_FILE, register_supervised
 
 from tint_sumo.benchmark import evaluate, worlds_suite
 from tint_sumo.core.files import write_frame, write_json, write_text
-from tint_sumo.core.percentages import percent_and_ends
+from tint_sumo.core.percentages import percent, percent_and_ends
 from tint_sumo.core.statistics import (
     Scores,
     improvement,
@@ -121,11 +121,11 @@ def scores_lines(table: pandas.DataFrame) -> Lines:
         collisions = _by_seed(trained[trained["method"] == method], "collision")
         above = "-"
         if reference is not None and method != REFERENCE:
-            above = percent_and_ends(improvement(scores, reference), improvement_interval(scores, reference), digits=0)
+            above = _with_interval(improvement(scores, reference), improvement_interval(scores, reference), scores)
         lines.append(
             [
                 f"`{method}`",
-                percent_and_ends(interquartile_mean(scores), interquartile_interval(scores), digits=0),
+                _with_interval(interquartile_mean(scores), interquartile_interval(scores), scores),
                 ", ".join(f"{100 * score:.0f}" for score in scores.mean(axis=1)),
                 ", ".join(f"{100 * score:.1f}" for score in collisions.mean(axis=1)),
                 ", ".join(str(count) for count in (collisions <= CAREFUL).sum(axis=1)),
@@ -133,6 +133,11 @@ def scores_lines(table: pandas.DataFrame) -> Lines:
             ]
         )
     return lines
+
+
+def _with_interval(share: float, interval: tuple[float, float], scores: Scores) -> str:
+    """Return a share in percent, with its interval over seeds if there are several."""
+    return percent(share, 0) if len(scores) == 1 else percent_and_ends(share, interval, digits=0)
 
 
 def _by_seed(table: pandas.DataFrame, outcome: str) -> Scores:

@@ -48,8 +48,6 @@ def contenders(runs: Path) -> Iterator[tuple[str, str, str]]:
     """Yield the world of the training, the name of the method, and name or path of each policy; with its seed last."""
     for name in OTHERS:
         yield "" if name == "ttc" else "old", name, name
-    if (runs / NETWORK_FILE).exists():
-        register_supervised(runs / NETWORK_FILE)
     for folder in sorted(runs.iterdir()):
         if (folder / "policy.safetensors").exists():
             yield TRAINED_IN, folder.name.split(".")[0], str(folder)
@@ -182,6 +180,8 @@ def main() -> None:
     parser.add_argument("--ship", action="store_true")
     given = parser.parse_args()
     if given.runs is not None:
+        if (given.runs / NETWORK_FILE).exists():
+            register_supervised(given.runs / NETWORK_FILE)
         rows = measure_all(given.runs, given.cases, given.out)
         if given.ship:
             ship(given.runs, rows)

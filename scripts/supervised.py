@@ -12,7 +12,6 @@ the episode, those who have left included; the differences; and how many steps t
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,14 +19,14 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from tint_sumo.config import ALL_MIXES, NO_LEADER_GAP_M, PPO_BUDGETS, STEP_S, RelativeSettings
+from tint_sumo.config import ALL_MIXES, NO_LEADER_GAP_M, PPO_BUDGETS, STEP_S, RelativeSettings, Steady
 from tint_sumo.core.determinism import single_threaded
 from tint_sumo.core.files import write_bytes
 from tint_sumo.envs.worlds import find_world, scene_in
 from tint_sumo.jobs.table import one_job
 from tint_sumo.methods.registry import Learned, register
 from tint_sumo.methods.training import train_policy
-from tint_sumo.policy.trait_sources import Frame, TraitSource
+from tint_sumo.policy.trait_sources import NeighbourTraits
 from tint_sumo.scenes import T_INTERSECTION, paper_scene
 from tint_sumo.traits.perceived import Perceived
 from tint_sumo.traits.relative import LATENTS, RelativeStream
@@ -42,43 +41,41 @@ HIDDEN = 64
 TRAFFICS, FIRST_TRAFFIC = 6, 20  # of 288 environments and 50 s each
 EPOCHS, BATCH, LEARNING_RATE = 4, 1024, 2e-3
 _KNOWN_STEPS = 20.0  # that tell half of what can be known
-_LEAST_SPEED_MPS, _FIRST_STEPS, _NEW_LEADER_M = 1.5, 4, 3.0  # of steps that count
+_FIRST_STEPS, _NEW_LEADER_M = 4, 3.0  # of steps that count
 
 Floats = NDArray[np.float64]
 
 
-class Comparison:
-    """Statistics of the tracks in N x V slots, compared with those of the others in each episode."""
+class Comparison(RelativeStream):
+    """Relative traits, and statistics of the tracks in N x V slots compared with the others in each episode."""
 
     def __init__(self, num_envs: int, slots: int) -> None:
         shape, statistics = (num_envs, slots), (num_envs, slots, STATISTICS)
-        self._stream = RelativeStream(RelativeSettings(), num_envs, slots)
+        super().__init__(RelativeSettings(), num_envs, slots)
         self._tracks = {key: np.zeros(shape) for key in ("steps", "position", "gap", "speed", "moved")}
         self._tracks |= {"sums": np.zeros((*shape, 2)), "mean": np.zeros(statistics), "weight": np.zeros(statistics)}
         self._gone = np.zeros((num_envs, 2, STATISTICS))  # weighted sums over tracks that have ended, and their weights
 
-    def memory(self) -> dict[str, Any]:
-        """Return the arrays with all that is known of the tracks, by name."""
-        stream = {f"stream_{name}": part for name, part in self._stream.memory().items()}
-        return {**self._tracks, "gone": self._gone, **stream}
+    def memory(self) -> dict[str, NDArray[np.generic]]:
+        compared = {f"compared_{name}": part for name, part in self._tracks.items()}
+        return {**super().memory(), **compared, "gone": self._gone}
 
     def begin(self, envs: NDArray[np.int64]) -> None:
-        """Forget the episodes of some environments."""
-        self._stream.begin(envs)
+        super().begin(envs)
         self._gone[envs] = 0.0
         self._tracks["steps"][envs] = 0.0
 
-    def advance(
+    def compare(
         self, envs: NDArray[np.int64], present: NDArray[np.bool_], position_m: Floats, gap_m: Floats
     ) -> NDArray[np.float32]:
         """Take one step in K environments, arrays (K, V); return the network's inputs (K, V, 27)."""
-        relative = self._stream.advance(envs, present, position_m, gap_m)
+        relative = super().advance(envs, present, position_m, gap_m)
         t = {name: part[envs] for name, part in self._tracks.items()}
         ended = ((t["steps"] > 0) & ~present)[..., None]
         self._gone[envs, 0] += np.sum(ended * t["weight"] * t["mean"], axis=1)
         self._gone[envs, 1] += np.sum(ended * t["weight"], axis=1)
         _extend(t, present, position_m, np.minimum(gap_m, NO_LEADER_GAP_M))
-        _summarise(t, present, self._stream.total[envs], self._stream.count[envs])
+        _summarise(t, present, self.total[envs], self.count[envs])
         for name, part in t.items():
             self._tracks[name][envs] = part
         return np.concatenate([relative, _compare(t["mean"], t["weight"], self._gone[envs])], axis=-1)
@@ -93,7 +90,7 @@ def _extend(t: dict[str, Floats], present: NDArray[np.bool_], position_m: Floats
     t["speed"] = np.where(goes_on, averaged, 0.0)
     change = (gap_m - t["gap"]) / STEP_S
     same_leader = np.abs(gap_m - t["gap"]) < _NEW_LEADER_M
-    counts = goes_on & same_leader & (t["steps"] > _FIRST_STEPS) & (t["speed"] > _LEAST_SPEED_MPS)
+    counts = goes_on & same_leader & (t["steps"] > _FIRST_STEPS) & (t["speed"] > Steady.least_speed_mps)
     step = np.stack([t["speed"], np.clip(change, -2.0, 2.0)], axis=-1)
     t["sums"] = np.where(goes_on[..., None], t["sums"] + step * counts[..., None], 0.0)
     t["moved"] = np.where(goes_on, t["moved"] + counts, 0.0)
@@ -144,7 +141,7 @@ def compared(seen: Perceived) -> NDArray[np.float32]:
     found = np.zeros((steps, num_envs, slots, INPUTS), np.float32)
     for step in range(steps):
         comparison.begin(np.flatnonzero(seen.begins[step]))
-        found[step] = comparison.advance(envs, seen.present[step], seen.position_m[step], seen.gap_m[step])
+        found[step] = comparison.compare(envs, seen.present[step], seen.position_m[step], seen.gap_m[step])
     return found
 
 
@@ -176,36 +173,31 @@ def fit() -> Beliefs:
     return model.eval().requires_grad_(False)
 
 
-class SupervisedTraits(TraitSource):
+class SupervisedStream(Comparison):
     """Relative traits with beliefs that are learnt with labels."""
 
-    needs_tracks = True
+    def __init__(self, model: Beliefs, num_envs: int, slots: int) -> None:
+        super().__init__(num_envs, slots)
+        self._model = model
+
+    def advance(
+        self, envs: NDArray[np.int64], present: NDArray[np.bool_], position_m: Floats, gap_m: Floats
+    ) -> NDArray[np.float32]:
+        inputs = self.compare(envs, present, position_m, gap_m)
+        traits = inputs[..., :LATENTS].copy()
+        traits[present, 0] = torch.tanh(0.5 * self._model(torch.from_numpy(inputs[present]))).numpy()
+        return traits
+
+
+class SupervisedTraits(NeighbourTraits):
+    """Traits from a ``SupervisedStream``."""
 
     def __init__(self, model: Beliefs) -> None:
+        super().__init__(RelativeSettings())
         self.model = model
 
-    def attach(self, num_envs: int, max_vehicles: int) -> None:
-        super().attach(num_envs, max_vehicles)
-        self._comparison = Comparison(num_envs, max_vehicles)
-
-    def memory(self) -> dict[str, Any]:
-        return {**super().memory(), **self._comparison.memory()}
-
-    def begin(self, frame: Frame) -> None:
-        envs = np.flatnonzero(frame.done)
-        self._comparison.begin(envs)
-        self._follow(frame, envs)
-
-    def advance(self, frame: Frame) -> None:
-        self._follow(frame, np.arange(len(frame.done)))
-
-    def _follow(self, frame: Frame, envs: NDArray[np.int64]) -> None:
-        position_m, gap_m = (frame.slots[key][envs].astype(np.float64) for key in ("position_m", "gap_m"))
-        present = frame.present[envs]
-        inputs = self._comparison.advance(envs, present, position_m, gap_m)
-        self.traits[envs] = inputs[..., :LATENTS]
-        rows, slots = np.nonzero(present)
-        self.traits[envs[rows], slots, 0] = torch.tanh(0.5 * self.model(torch.from_numpy(inputs[present]))).numpy()
+    def make_stream(self, num_envs: int, max_vehicles: int) -> SupervisedStream:
+        return SupervisedStream(self.model, num_envs, max_vehicles)
 
 
 def register_supervised(network: Path) -> None:

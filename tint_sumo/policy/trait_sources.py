@@ -266,7 +266,11 @@ class NeighbourTraits(TraitSource):
 
     def attach(self, num_envs: int, max_vehicles: int) -> None:
         super().attach(num_envs, max_vehicles)
-        self._stream = RelativeStream(self.settings, num_envs, max_vehicles)
+        self._stream = self.make_stream(num_envs, max_vehicles)
+
+    def make_stream(self, num_envs: int, max_vehicles: int) -> RelativeStream:
+        """Return a new stream for ``num_envs`` environments of so many slots; a subclass may have another one."""
+        return RelativeStream(self.settings, num_envs, max_vehicles)
 
     def memory(self) -> dict[str, Any]:
         return {**super().memory(), **{f"stream_{name}": part for name, part in self._stream.memory().items()}}

@@ -24,7 +24,7 @@ from tint_sumo.methods.registry import find_learned
 from tint_sumo.methods.training import new_model, training_venv
 from tint_sumo.scenes import paper_scene
 
-WARM_UP, MEASURED = 3, 4  # rollouts
+WARM_UP, MEASURED = 24_576, 32_768  # decisions, three and four of the longest rollouts
 Calls = tuple[str, str]  # end of the file's path and name of a function
 
 
@@ -49,7 +49,11 @@ PARTS = (
     Part("the policy's actions", (ROLLOUT,), (WRAPPED,)),
     Part("update", (UPDATE,)),
 )
-TRAININGS = (("no_labels", "old", "full"), ("relative", "strangers", "strangers"))  # method, world and budget
+TRAININGS = (  # method, world and budget
+    ("no_labels", "old", "full"),
+    ("relative", "strangers", "strangers"),
+    ("no_labels", "old", "paper"),
+)
 
 
 def cpu_s(stats: pstats.Stats, functions: tuple[Calls, ...]) -> float:
@@ -65,24 +69,24 @@ def profile(method: str, world: str, budget: str) -> list[dict[str, object]]:
     """Return the rows of a training: the CPU time per decision of each part."""
     learned, place = find_learned(method), find_world(world)
     settings = learned.settings_of(PPO_BUDGETS[budget])
-    rollout = settings.n_envs * settings.n_steps
     scenes = [scene_in(place, paper_scene())]
     with (
         single_threaded(),
         closing(training_venv(learned, None, ALL_MIXES, settings, scenes, place.sensors)) as venv,
     ):
-        model = new_model(venv, 0, settings).learn(WARM_UP * rollout)
+        model = new_model(venv, 0, settings).learn(WARM_UP)
         start_s = time.process_time()
-        model.learn(MEASURED * rollout, reset_num_timesteps=False)
-        whole_us = 1e6 * (time.process_time() - start_s) / (MEASURED * rollout)
+        model.learn(MEASURED, reset_num_timesteps=False)
+        whole_us = 1e6 * (time.process_time() - start_s) / MEASURED
         profiler = cProfile.Profile(time.process_time)
-        profiler.runcall(model.learn, MEASURED * rollout, reset_num_timesteps=False)
+        profiler.runcall(model.learn, MEASURED, reset_num_timesteps=False)
     stats = pstats.Stats(profiler)
     times_s = {part.name: cpu_s(stats, part.functions) - cpu_s(stats, part.without) for part in PARTS}
     return [
         {
             "method": method,
             "world": world,
+            "budget": budget,
             "part": name,
             "share_percent": round(100 * part_s / sum(times_s.values()), 1),
             "cpu_us_per_decision": round(whole_us * part_s / sum(times_s.values()), 1),

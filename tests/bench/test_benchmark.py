@@ -9,7 +9,7 @@ import pytest
 from tint_sumo import ENV_IDS
 from tint_sumo.bench import Sizes, run_benchmark
 from tint_sumo.bench.measuring import Clocks
-from tint_sumo.bench.policies import training_speed
+from tint_sumo.bench.policies import TrainingSpeed, training_speed
 from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.simulation.timing import StepPart, does
 from tint_sumo.study.budgets import BUDGETS
@@ -25,6 +25,7 @@ TINY = Sizes(
     windows=20,
     training_windows=50,
     ppo=TINY_PPO,
+    paper_ppo=TINY_PPO,
     rollouts=2,
     decisions=3,
     memory_env_steps=(12, 24),
@@ -52,9 +53,7 @@ def test_the_benchmark_measures_everything() -> None:
         "train_windows_per_s",
         "encode_ms",
         "scenes_to_t_intersection",
-        "train_decisions_per_s",
-        "recurrent_ppo_decisions_per_s",
-        "train_to_recurrent_ppo",
+        "policy_trainings",
         "decision_ms",
         "breakdown_us",
     }
@@ -67,8 +66,9 @@ def test_the_benchmark_measures_everything() -> None:
     assert list(printed["breakdown_us"]) == list(StepPart)
     speeds = [printed[key] for key in printed if key.endswith("steps_per_s")]
     assert min(speeds + list(printed["breakdown_us"].values())) > 0.0
-    for key in ("train_decisions_per_s", "recurrent_ppo_decisions_per_s", "train_to_recurrent_ppo", "decision_ms"):
-        assert printed[key] > 0.0
+    assert [training.pop("budget") for training in printed["policy_trainings"]] == ["full", "paper"]
+    assert all(min(training.values()) > 0.0 for training in printed["policy_trainings"])
+    assert printed["decision_ms"] > 0.0
     for part in ("train_windows_per_s", "encode_ms"):
         assert printed[part].keys() == TRAIT_METHODS.keys()
         assert min(printed[part].values()) > 0.0
@@ -81,17 +81,16 @@ def test_the_benchmark_measures_everything() -> None:
     assert "clocks around the functions that do these parts" in table
     assert "our speed to its" in table
     assert "trait inference at every simulation step" in table
-    alone = replace(found, recurrent_ppo_decisions_per_s=None, train_to_recurrent_ppo=None).table()
-    assert "sb3-contrib is not installed: pip install sb3-contrib" in alone
-    assert "our speed to its" not in alone
 
 
 def test_training_is_measured_without_sb3_contrib(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sb3_contrib", None)  # as if it were not installed
-    found = training_speed(TINY_PPO, turns=1)
-    ours = found.pop("train_decisions_per_s")
-    assert ours is not None and ours > 0.0
-    assert found == {"recurrent_ppo_decisions_per_s": None, "train_to_recurrent_ppo": None}
+    found = training_speed("quick", TINY_PPO, turns=1)
+    assert found.decisions_per_s > 0.0
+    assert found == TrainingSpeed("quick", found.decisions_per_s, None, None)
+    assert found.rows()[1:] == [
+        ("  with sb3-contrib's RecurrentPPO", "sb3-contrib is not installed: pip install sb3-contrib")
+    ]
 
 
 class Work:

@@ -24,7 +24,7 @@ import torch
 from tint_sumo import ENV_IDS
 from tint_sumo.bench.measuring import Clocks, Turn, turns_apart
 from tint_sumo.bench.networks import NetworkSpeed, network_speeds
-from tint_sumo.bench.policies import DECISION_METHOD, INSTALL_SB3_CONTRIB, decision_ms, training_speed
+from tint_sumo.bench.policies import DECISION_METHOD, TrainingSpeed, decision_ms, training_speed
 from tint_sumo.config import PPO_BUDGETS, TRAIT_BUDGETS, WINDOW_STEPS, PpoSettings
 from tint_sumo.core.determinism import single_threaded
 from tint_sumo.core.progress import Progress
@@ -63,7 +63,8 @@ class Sizes:
     windows: int = 100_000
     training_windows: int = 40_000
     ppo: PpoSettings = PPO_BUDGETS["full"]
-    rollouts: int = 3  # rollouts of the policy's training, updates included
+    paper_ppo: PpoSettings = PPO_BUDGETS["paper"]
+    rollouts: int = 3  # turns of a policy's training, each a rollout with its updates, or several short ones
     decisions: int = 1_000  # decisions of one policy with one intersection
     memory_env_steps: tuple[int, int] = (100_000, 2_000_000)  # memory growth is measured between these
 
@@ -124,9 +125,7 @@ class Benchmark:
     memory_growth_mib: float
     train_windows_per_s: dict[str, float]  # by trait method, with one thread
     encode_ms: dict[str, float]  # the same, of all 12 slots of 64 intersections
-    train_decisions_per_s: float  # PPO as in the full budget without traits, one process, one thread
-    recurrent_ppo_decisions_per_s: float | None  # the same of sb3-contrib's; None where that is not installed
-    train_to_recurrent_ppo: float | None
+    policy_trainings: tuple[TrainingSpeed, ...]  # as in the study, and with the paper's recipe
     decision_ms: float  # see DECISION_METHOD
     breakdown_us: dict[str, float]  # per environment step
 
@@ -154,22 +153,13 @@ class Benchmark:
                 (f"encoding {_ENCODED} windows, {method}", f"{one_ms:.2f} ms")
                 for method, one_ms in self.encode_ms.items()
             ),
-            ("training a policy", f"{self.train_decisions_per_s:,.0f} decisions/s"),
-            *self._comparison(),
+            *(row for training in self.policy_trainings for row in training.rows()),
             ("deciding with streaming traits", f"{self.decision_ms:.2f} ms"),
             ("where an environment step's time goes", f"{total_us:.1f} us"),
             *((f"  {part}", f"{us:.1f} us  {us / total_us:4.0%}") for part, us in self.breakdown_us.items()),
         ]
         lines = [f"{name:38} {value}" for name, value in rows]
         return "\n".join([*lines, f"  ({BREAKDOWN_METHOD})", f"  ({DECISION_METHOD})"])
-
-    def _comparison(self) -> list[tuple[str, str]]:
-        if self.recurrent_ppo_decisions_per_s is None:
-            return [("  with sb3-contrib's RecurrentPPO", INSTALL_SB3_CONTRIB)]
-        return [
-            ("  with sb3-contrib's RecurrentPPO", f"{self.recurrent_ppo_decisions_per_s:,.0f} decisions/s"),
-            ("  our speed to its", f"{self.train_to_recurrent_ppo:.2f}"),
-        ]
 
 
 def run_benchmark(sizes: Sizes | None = None, progress: bool = True) -> Benchmark:
@@ -377,7 +367,9 @@ def _traits(sizes: Sizes) -> dict[str, Any]:
 
 
 def _policies(sizes: Sizes) -> dict[str, Any]:
-    return training_speed(sizes.ppo, sizes.rollouts) | {"decision_ms": decision_ms(sizes.ppo, sizes.decisions)}
+    budgets = {"full": sizes.ppo, "paper": sizes.paper_ppo}
+    trainings = tuple(training_speed(name, settings, sizes.rollouts) for name, settings in budgets.items())
+    return {"policy_trainings": trainings, "decision_ms": decision_ms(sizes.ppo, sizes.decisions)}
 
 
 def _train_windows_per_s(method: str, windows: int) -> float:

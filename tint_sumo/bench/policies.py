@@ -1,8 +1,10 @@
 """Speed of policies in training, beside sb3-contrib's recurrent PPO where it is installed, and time of a decision."""
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from statistics import median
 from typing import Any
@@ -23,19 +25,41 @@ from tint_sumo.methods.training import new_model, training_venv
 from tint_sumo.policy import ActionRepeat, GruPolicy, StreamingTraits, TraitObservation
 from tint_sumo.scenes import paper_scene
 
-INSTALL_SB3_CONTRIB = "sb3-contrib is not installed: pip install sb3-contrib"
 DECISION_METHOD = (
     "a decision: with one intersection and one thread, trait inference at every simulation step of a decision and one "
     "call of the network, with all wrappers; steps of the environment itself do not count"
 )
 
+_LEAST_DECISIONS = 1_000  # of a turn: the paper's rollouts are much shorter than the study's
+
 MakeModel = Callable[[VecEnv, int, PpoSettings], OnPolicyAlgorithm]
 
 
-def training_speed(settings: PpoSettings, turns: int) -> dict[str, float | None]:
-    """Measure in turns, each in another process, a rollout of our PPO and its updates, and the same of sb3-contrib's.
+@dataclass(frozen=True)
+class TrainingSpeed:
+    """Decisions per second of PPO with a budget's settings, without traits, in one process with one thread."""
 
-    The first rollout of each, in which all episodes begin together, does not count.
+    budget: str
+    decisions_per_s: float
+    recurrent_ppo_decisions_per_s: float | None  # the same of sb3-contrib's; None where that is not installed
+    ratio: float | None  # of the two
+
+    def rows(self) -> list[tuple[str, str]]:
+        ours = (f"training a policy, budget {self.budget}", f"{self.decisions_per_s:,.0f} decisions/s")
+        if self.recurrent_ppo_decisions_per_s is None:
+            missing = "sb3-contrib is not installed: pip install sb3-contrib"
+            return [ours, ("  with sb3-contrib's RecurrentPPO", missing)]
+        return [
+            ours,
+            ("  with sb3-contrib's RecurrentPPO", f"{self.recurrent_ppo_decisions_per_s:,.0f} decisions/s"),
+            ("  our speed to its", f"{self.ratio:.2f}"),
+        ]
+
+
+def training_speed(budget: str, settings: PpoSettings, turns: int) -> TrainingSpeed:
+    """Measure in turns, each in another process, rollouts of our PPO with their updates, and the same of sb3-contrib's.
+
+    The first turn of each, in which all episodes begin together, does not count.
     """
     makers: list[MakeModel] = [new_model]
     if find_spec("sb3_contrib"):
@@ -44,21 +68,23 @@ def training_speed(settings: PpoSettings, turns: int) -> dict[str, float | None]
         trainings = [stack.enter_context(turns_apart(_training, make, settings)) for make in makers]
         _, *speeds = [[turn() for turn in trainings] for _ in range(1 + turns)]
     compared = len(makers) == 2
-    return {
-        "train_decisions_per_s": median(ours for ours, *_ in speeds),
-        "recurrent_ppo_decisions_per_s": median(theirs for _, theirs in speeds) if compared else None,
-        "train_to_recurrent_ppo": median(ours / theirs for ours, theirs in speeds) if compared else None,
-    }
+    return TrainingSpeed(
+        budget,
+        median(ours for ours, *_ in speeds),
+        median(theirs for _, theirs in speeds) if compared else None,
+        median(ours / theirs for ours, theirs in speeds) if compared else None,
+    )
 
 
 @contextmanager
 def _training(make: MakeModel, settings: PpoSettings) -> Iterator[Turn]:
-    """Give turns that measure the decisions per second of one more rollout with its updates, as in the study."""
+    """Give turns that measure the decisions per second of more rollouts with their updates, as in the study."""
     venv = training_venv(find_learned("no_labels"), None, ALL_MIXES, settings, [paper_scene()])
     with closing(venv), single_threaded():
         model = make(venv, 0, settings)
         model.set_logger(Logger(None, []))
-        decisions = settings.n_envs * settings.n_steps
+        rollout = settings.n_envs * settings.n_steps
+        decisions = rollout * math.ceil(_LEAST_DECISIONS / rollout)
 
         def turn() -> float:
             start = time.perf_counter()

@@ -6,8 +6,8 @@ RUNS is a folder of training runs METHOD.SEED, such as ``tint-sumo policy train 
 --budget strangers --seed 0 --out RUNS/oracle.0`` makes. A row of the table is a policy in a world; the rules and the
 shipped policies of the old world stand there, too. Rows that an earlier, interrupted call has written are kept. Beside
 the table stand its means by method and world, and its scores by method, as Markdown; without RUNS these are remade.
-With --ship, data/models/policies/strangers gets the policy of the first seed of each method that needs no trait model;
-its card has the rates of all seeds. RUNS may also hold policies of ``scripts/supervised.py``, the bound of inference.
+With --ship, data/models/policies/strangers gets the policy of the first seed of each method that needs no trait model, if
+RUNS has it; its card has the rates of all seeds. RUNS may also hold policies of ``scripts/supervised.py``, the bound of inference.
 """
 
 import argparse
@@ -166,10 +166,12 @@ def ship(runs: Path, rows: Sequence[Mapping[str, str]]) -> None:
             }
             results[world] = {"seeds": seeds, "episodes": int(found[0]["cases"]), **means}
         run, shipped = runs / f"{method}.{seeds[0]}" / POLICY, SHIPPED / method
-        SHIPPED.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(weights_file(run), weights_file(shipped))
-        write_json(card_file(shipped), {**read_policy_card(run), "results": results})
-        print(f"wrote {weights_file(shipped)}")
+        trained_here = weights_file(run).exists()
+        if trained_here:
+            SHIPPED.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(weights_file(run), weights_file(shipped))
+        write_json(card_file(shipped), {**read_policy_card(run if trained_here else shipped), "results": results})
+        print(f"wrote {card_file(shipped)}")
 
 
 def main() -> None:

@@ -471,6 +471,27 @@ def test_the_tables_of_policies_among_strangers_are_those_of_the_results() -> No
         assert careful == ", ".join(str((rows["collision_percent"] <= 1.0).sum()) for rows in seeds)
 
 
+def test_what_traits_gain_among_strangers_is_that_of_the_results() -> None:
+    measured = pandas.read_csv(RESULTS / "strangers.csv", keep_default_na=False, dtype={"seed": str})
+    trained = measured[measured["trained_in"] == "strangers"]
+    success = trained.groupby(["method", "world"])["success_percent"].mean()
+    gain = (success["relative"] - success["no_labels"]).sort_values()
+    mean = success.groupby("method").mean()
+    page = _prose("docs/explanation/strangers.md")
+    worlds = f"in 16 of 18 worlds, by {gain.iloc[2]:.0f} to {gain.iloc[-1]:.0f} points"
+    for text in (_prose("README.md"), _prose("docs/results/index.md"), page):
+        assert worlds in text
+    assert f"(69 against {mean['no_labels']:.0f} %)" in page and round(mean["relative"]) == 69
+    assert set(gain.index[:2]) == {"headway_1.5", "same_speed"}  # where the two are alike
+    for method, shown in {"streaming": "`streaming` succeeds in", "vae": "the paper's method (`vae`) in"}.items():
+        assert f"{shown} {mean[method]:.0f}" in page
+    by_seed = trained.groupby(["method", "seed"])["success_percent"].mean()
+    oracle, without = by_seed["oracle"], by_seed["no_labels"]
+    assert f"those of the oracle {oracle.min():.0f} to {oracle.max():.0f}" in page
+    assert f"The five seeds of no labels have {without.min():.0f} to {without.max():.0f}" in page
+    assert "(five seeds each)" in _prose("README.md") and len(without) == len(by_seed["relative"]) == 5
+
+
 def test_the_profile_of_trainings_is_that_of_the_results() -> None:
     (table,) = (one for one in _tables(DOCS / "explanation" / "training.md") if "SUMO's step" in one)
     _, _, *lines = table.strip().split("\n")

@@ -19,6 +19,7 @@ import numpy as np
 import pandas
 import torch
 from matplotlib.figure import Figure
+from measure_strangers import TRAINED_IN, read_table
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
@@ -132,9 +133,9 @@ def make_figures(images: Path) -> None:
 
 def rows_of_strangers() -> list[StoredRow]:
     """Return rows of ``strangers.csv`` for the figure: a method's seeds in one, with intervals over all cases."""
-    table = pandas.read_csv(DATA / "results" / "strangers.csv", keep_default_na=False)
+    table = read_table(DATA / "results" / "strangers.csv")
     table = table[table["method"].isin(AMONG_STRANGERS)]
-    table["is_trained"] = table["trained_in"] == "strangers"
+    table["is_trained"] = table["trained_in"] == TRAINED_IN
     rows = []
     for (is_trained, method, world), found in table.groupby(["is_trained", "method", "world"], sort=False):
         cases, seeds = int(found["cases"].iloc[0]), tuple(range(len(found)))

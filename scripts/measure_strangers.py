@@ -7,7 +7,8 @@ RUNS is a folder of training runs METHOD.SEED, such as ``tint-sumo policy train 
 shipped policies of the old world stand there, too. Rows that an earlier, interrupted call has written are kept. Beside
 the table stand its means by method and world, and its scores by method, as Markdown; without RUNS these are remade.
 With --ship, data/models/policies/strangers gets the policy of the first seed of each method that needs no trait model, if
-RUNS has it; its card has the rates of all seeds. RUNS may also hold policies of ``scripts/supervised.py``, the bound of inference.
+RUNS has it; its card has the rates of all seeds. RUNS may also hold policies of ``scripts/supervised.py``, the bound of
+inference.
 """
 
 import argparse
@@ -143,9 +144,14 @@ def _by_seed(table: pandas.DataFrame, outcome: str) -> Scores:
     return table.pivot(index="seed", columns="world", values=f"{outcome}_percent").to_numpy() / 100.0
 
 
+def read_table(file: Path) -> pandas.DataFrame:
+    """Return a table that this script has written; rules have neither a seed nor a world of their training."""
+    return pandas.read_csv(file, keep_default_na=False, dtype={"seed": str})
+
+
 def write_tables(file: Path) -> None:
     """Write the Markdown tables that follow from a table of all policies, beside it."""
-    table = pandas.read_csv(file, keep_default_na=False, dtype={"seed": str})
+    table = read_table(file)
     target = file.with_suffix(".md")
     write_text(target, f"{markdown_table(worlds_lines(table))}\n\n{markdown_table(scores_lines(table))}\n")
     print(f"wrote {target}")

@@ -444,9 +444,13 @@ def test_the_table_of_the_papers_recipe_is_that_of_its_cases() -> None:
         assert cells == [*(rates(row) for row in rows), published]
 
 
+def _strangers() -> pandas.DataFrame:
+    return pandas.read_csv(RESULTS / "strangers.csv", keep_default_na=False, dtype={"seed": str})
+
+
 def test_the_tables_of_policies_among_strangers_are_those_of_the_results() -> None:
     worlds, scores = _tables(RESULTS / "strangers.md")
-    measured = pandas.read_csv(RESULTS / "strangers.csv", keep_default_na=False, dtype={"seed": str})
+    measured = _strangers()
     assert set(measured["cases"]) == {200}
     head, _, *lines = worlds.strip().split("\n")
     columns = []
@@ -472,7 +476,7 @@ def test_the_tables_of_policies_among_strangers_are_those_of_the_results() -> No
 
 
 def test_what_traits_gain_among_strangers_is_that_of_the_results() -> None:
-    measured = pandas.read_csv(RESULTS / "strangers.csv", keep_default_na=False, dtype={"seed": str})
+    measured = _strangers()
     trained = measured[measured["trained_in"] == "strangers"]
     success = trained.groupby(["method", "world"])["success_percent"].mean()
     gain = (success["relative"] - success["no_labels"]).sort_values()

@@ -6,7 +6,7 @@ RUNS is a folder of training runs METHOD.SEED, such as ``tint-sumo policy train 
 --budget strangers --seed 0 --out RUNS/oracle.0`` makes. A row of the table is a policy in a world; the rules and the
 shipped policies of the old world stand there, too. Rows that an earlier, interrupted call has written are kept. Beside
 the table stand its means by method and world, and its scores by method, as Markdown; without RUNS these are remade.
-With --ship, data/models/policies/strangers gets the policy of the first seed of each method that needs no trait model, if
+With --ship, data/models/policies/strangers gets the policy of the first seed of each method without a trait model, if
 RUNS has it; its card has the rates of all seeds. RUNS may also hold policies of ``scripts/supervised.py``, the bound of
 inference.
 """

@@ -1,11 +1,12 @@
-"""Test policies that were trained with the paper's own recipe, and others beside them; writes a table and a figure.
+"""Test policies that were trained with the paper's own recipe, and others beside them; writes a table.
 
 Usage: python scripts/measure_paper_recipe.py RUNS [--cases 500] [--out data/results/paper_recipe.csv]
     [--figure data/images/paper_recipe.png]
 
 RUNS is a folder of training runs BUDGET.METHOD.SEED, such as ``tint-sumo policy train --method oracle --budget paper
 --p-conservative 0.4 --seed 0 --out RUNS/paper.oracle.0`` makes; with BUDGET "full" they have our recipe. Each policy is
-tested in the mix that it was trained for, after 25, 50 and 100 % of its training. The figure has the trainings' curves.
+tested in the mix that it was trained for, after 25, 50 and 100 % of its training. Rows that the table has already of
+other trainings are kept, so trainings can be made one by one. With --figure, the curves of those in RUNS are drawn.
 """
 
 import argparse
@@ -25,6 +26,7 @@ from tint_sumo.policy.storage import card_file, read_policy_card
 from tint_sumo.study.published import RATES_PERCENT
 
 LOOKS = {"paper": ("#1793fc", "the paper's recipe"), "full": ("#d77e0b", "our recipe")}
+TRAINING = ["budget", "method", "p_conservative", "seed"]  # columns that tell trainings apart
 LINES = {"success": "-", "collision": ":"}
 POINTS = 400  # of a curve
 
@@ -59,6 +61,16 @@ def rows_of(budget: str, folder: Path, cases: int) -> Iterator[dict[str, object]
         }
 
 
+def with_kept(table: pandas.DataFrame, out: Path) -> pandas.DataFrame:
+    """Return a table of trainings with the rows of other trainings that ``out`` has already."""
+    if out.exists():
+        before = pandas.read_csv(out)
+        measured = set(table[TRAINING].itertuples(index=False, name=None))
+        others = [training not in measured for training in before[TRAINING].itertuples(index=False, name=None)]
+        table = pandas.concat([before[others], table], ignore_index=True)
+    return table.sort_values([*TRAINING, "percent"], ignore_index=True)
+
+
 def plot(runs: Path, file: Path) -> None:
     """Draw success and collisions of the last 500 episodes in training against the simulated time."""
     figure = Figure(figsize=(7.5, 4.2), dpi=150, layout="constrained")
@@ -83,16 +95,17 @@ def main() -> None:
     parser.add_argument("runs", type=Path)
     parser.add_argument("--cases", type=int, default=500)
     parser.add_argument("--out", type=Path, default=Path("data/results/paper_recipe.csv"))
-    parser.add_argument("--figure", type=Path, default=Path("data/images/paper_recipe.png"))
+    parser.add_argument("--figure", type=Path)
     given = parser.parse_args()
     rows = []
     for budget, folder in finished(given.runs):
         for row in rows_of(budget, folder, given.cases):
             rows.append(row)
             print(*row.values(), flush=True)
-    write_frame(pandas.DataFrame(rows), given.out)
+    write_frame(with_kept(pandas.DataFrame(rows), given.out), given.out)
     print(f"wrote {given.out}")
-    plot(given.runs, given.figure)
+    if given.figure is not None:
+        plot(given.runs, given.figure)
 
 
 if __name__ == "__main__":

@@ -444,6 +444,24 @@ def test_the_table_of_the_papers_recipe_is_that_of_its_cases() -> None:
         assert cells == [*(rates(row) for row in rows), published]
 
 
+def test_the_learning_rates_are_those_of_the_results() -> None:
+    (table,) = (one for one in _tables(DOCS / "explanation" / "training.md") if "| 0.001 |" in one)
+    _, _, *lines = table.strip().split("\n")
+    measured = pandas.read_csv(RESULTS / "learning_rates.csv")
+    short = measured[measured["variant"].str.contains("total_steps=400000")]
+    success = 100.0 * short.groupby(["method", "variant"], sort=False)["success"].mean().unstack()
+    assert len(lines) == len(success) == 8
+    for line, (method, rates) in zip(lines, success.iterrows(), strict=True):
+        name, *cells = line.strip("| ").split(" | ")
+        assert name == f"`{method}`"
+        assert cells == [f"**{rate:.1f}**" if rate == rates.max() else f"{rate:.1f}" for rate in rates]
+    assert (success.idxmax(axis=1) == "learning_rate=0.003,total_steps=400000").sum() == 6
+    page = _prose("docs/explanation/training.md")
+    assert "Six of the eight do best with 0.003" in page
+    whole = 100.0 * measured[measured["variant"] == "learning_rate=0.006"].groupby("method")["success"].mean()
+    assert f"the oracle has {whole['oracle']:.1f} % then and `streaming` {whole['streaming']:.1f} %" in page
+
+
 def _strangers() -> pandas.DataFrame:
     return pandas.read_csv(RESULTS / "strangers.csv", keep_default_na=False, dtype={"seed": str})
 

@@ -26,7 +26,7 @@ from tint_sumo.policy.storage import card_file, read_policy_card
 from tint_sumo.study.published import RATES_PERCENT
 
 LOOKS = {"paper": ("#1793fc", "the paper's recipe"), "full": ("#d77e0b", "our recipe")}
-TRAINING = ["budget", "method", "p_conservative", "seed"]  # columns that tell trainings apart
+KEY = ["budget", "method", "p_conservative", "seed", "percent"]  # columns that tell rows apart
 LINES = {"success": "-", "collision": ":"}
 POINTS = 400  # of a curve
 
@@ -62,13 +62,10 @@ def rows_of(budget: str, folder: Path, cases: int) -> Iterator[dict[str, object]
 
 
 def with_kept(table: pandas.DataFrame, out: Path) -> pandas.DataFrame:
-    """Return a table of trainings with the rows of other trainings that ``out`` has already."""
+    """Return a table with the rows that ``out`` has already of other trainings."""
     if out.exists():
-        before = pandas.read_csv(out)
-        measured = set(table[TRAINING].itertuples(index=False, name=None))
-        others = [training not in measured for training in before[TRAINING].itertuples(index=False, name=None)]
-        table = pandas.concat([before[others], table], ignore_index=True)
-    return table.sort_values([*TRAINING, "percent"], ignore_index=True)
+        table = pandas.concat([pandas.read_csv(out), table])
+    return table.drop_duplicates(KEY, keep="last").sort_values(KEY, ignore_index=True)
 
 
 def plot(runs: Path, file: Path) -> None:

@@ -23,7 +23,7 @@ from tint_sumo.study.plan import plan
 
 CORES = 2
 FULL = BUDGETS["full"]
-ROLLOUT = FULL.ppo.n_envs * FULL.ppo.n_steps
+ROLLOUT = FULL.ppo.rollout
 ROLLOUTS = 8
 CASES = 1000
 MACHINES = (1, 8, 64, 1000)

@@ -24,7 +24,7 @@ from tint_sumo.methods.registry import find_learned
 from tint_sumo.methods.training import new_model, training_venv
 from tint_sumo.scenes import paper_scene
 
-WARM_UP, MEASURED = 24_576, 32_768  # decisions, three and four of the longest rollouts
+WARM_UP, MEASURED = 24_576, 32_768  # decisions at least: three and four of the longest rollouts
 Calls = tuple[str, str]  # end of the file's path and name of a function
 
 
@@ -74,12 +74,13 @@ def profile(method: str, world: str, budget: str) -> list[dict[str, object]]:
         single_threaded(),
         closing(training_venv(learned, None, ALL_MIXES, settings, scenes, place.sensors)) as venv,
     ):
-        model = new_model(venv, 0, settings).learn(WARM_UP)
+        decisions = settings.whole_rollouts(MEASURED)
+        model = new_model(venv, 0, settings).learn(settings.whole_rollouts(WARM_UP))
         start_s = time.process_time()
-        model.learn(MEASURED, reset_num_timesteps=False)
-        whole_us = 1e6 * (time.process_time() - start_s) / MEASURED
+        model.learn(decisions, reset_num_timesteps=False)
+        whole_us = 1e6 * (time.process_time() - start_s) / decisions
         profiler = cProfile.Profile(time.process_time)
-        profiler.runcall(model.learn, MEASURED, reset_num_timesteps=False)
+        profiler.runcall(model.learn, decisions, reset_num_timesteps=False)
     stats = pstats.Stats(profiler)
     times_s = {part.name: cpu_s(stats, part.functions) - cpu_s(stats, part.without) for part in PARTS}
     return [

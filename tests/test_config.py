@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tint_sumo.config import ALL_MIXES, Mix
+from tint_sumo.config import ALL_MIXES, Mix, PpoSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.structures import FieldError, Many, build, plain
 
@@ -49,3 +49,8 @@ def test_a_mix_has_a_mean_and_contains_the_mixes_between_its_ends() -> None:
     assert Mix(0.4).is_single and not ALL_MIXES.is_single
     assert all(ALL_MIXES.contains(one) for one in (ALL_MIXES, Mix(0.1), Mix(0.2, 0.9)))
     assert not any(Mix(0.4).contains(one) for one in (ALL_MIXES, Mix(0.5), Mix(0.4, 0.5)))
+
+
+@pytest.mark.parametrize(("least", "decisions"), [(1, 360), (360, 360), (361, 720), (32_768, 33_120)])
+def test_decisions_are_rounded_up_to_whole_rollouts(least: int, decisions: int) -> None:
+    assert PpoSettings(n_envs=12, n_steps=30).whole_rollouts(least) == decisions

@@ -4,6 +4,7 @@ Sources: "paper" is Liu et al., Learning to Navigate Intersections with Unsuperv
 "code" is the authors' published code, used where the paper gives no value; "SUMO" is Eclipse SUMO's default.
 """
 
+import math
 import re
 import statistics
 from collections.abc import Sequence
@@ -715,16 +716,25 @@ class PpoSettings:
 
     def __post_init__(self) -> None:
         require_ranges(self)
-        if self.n_envs * self.n_steps > MOST_DECISIONS:
+        if self.rollout > MOST_DECISIONS:
             raise InputError(
                 f"n_envs times n_steps must be {MOST_DECISIONS:,} decisions at most, which are in memory at a time, "
-                f"not {self.n_envs * self.n_steps:,}"
+                f"not {self.rollout:,}"
             )
         if self.n_minibatches > self.n_envs:
             raise InputError(
                 f"n_minibatches must be at most n_envs ({self.n_envs}), whose sequences stay whole, "
                 f"not {self.n_minibatches}"
             )
+
+    @property
+    def rollout(self) -> int:
+        """Decisions of a rollout, in all environments together."""
+        return self.n_envs * self.n_steps
+
+    def whole_rollouts(self, decisions: int) -> int:
+        """Return the decisions of as few whole rollouts as have at least so many ``decisions``."""
+        return self.rollout * math.ceil(decisions / self.rollout)
 
 
 # A small network is as accurate here as the paper's, trains in minutes and encodes 768 windows in less than 2 ms.

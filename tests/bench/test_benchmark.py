@@ -26,7 +26,7 @@ TINY = Sizes(
     training_windows=50,
     ppo=TINY_PPO,
     paper_ppo=TINY_PPO,
-    rollouts=2,
+    training_turns=2,
     decisions=3,
     memory_env_steps=(12, 24),
 )

@@ -64,7 +64,7 @@ class Sizes:
     training_windows: int = 40_000
     ppo: PpoSettings = PPO_BUDGETS["full"]
     paper_ppo: PpoSettings = PPO_BUDGETS["paper"]
-    rollouts: int = 3  # turns of a policy's training, each a rollout with its updates, or several short ones
+    training_turns: int = 3  # each a rollout of a policy's training with its updates, or several short ones
     decisions: int = 1_000  # decisions of one policy with one intersection
     memory_env_steps: tuple[int, int] = (100_000, 2_000_000)  # memory growth is measured between these
 
@@ -77,7 +77,7 @@ QUICK = Sizes(
     windows=10_000,
     training_windows=5_000,
     ppo=replace(PPO_BUDGETS["full"], n_envs=64, n_minibatches=4),  # half a rollout, minibatches as large as ever
-    rollouts=2,
+    training_turns=2,
     decisions=300,
     memory_env_steps=(20_000, 100_000),
 )
@@ -368,7 +368,7 @@ def _traits(sizes: Sizes) -> dict[str, Any]:
 
 def _policies(sizes: Sizes) -> dict[str, Any]:
     budgets = {"full": sizes.ppo, "paper": sizes.paper_ppo}
-    trainings = tuple(training_speed(name, settings, sizes.rollouts) for name, settings in budgets.items())
+    trainings = tuple(training_speed(name, settings, sizes.training_turns) for name, settings in budgets.items())
     return {"policy_trainings": trainings, "decision_ms": decision_ms(sizes.ppo, sizes.decisions)}
 
 

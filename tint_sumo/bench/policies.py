@@ -1,6 +1,5 @@
 """Speed of policies in training, beside sb3-contrib's recurrent PPO where it is installed, and time of a decision."""
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -83,8 +82,7 @@ def _training(make: MakeModel, settings: PpoSettings) -> Iterator[Turn]:
     with closing(venv), single_threaded():
         model = make(venv, 0, settings)
         model.set_logger(Logger(None, []))
-        rollout = settings.n_envs * settings.n_steps
-        decisions = rollout * math.ceil(_LEAST_DECISIONS / rollout)
+        decisions = settings.whole_rollouts(_LEAST_DECISIONS)
 
         def turn() -> float:
             start = time.perf_counter()
@@ -103,7 +101,7 @@ def _contrib_model(venv: VecEnv, seed: int, settings: PpoSettings) -> OnPolicyAl
         "MultiInputLstmPolicy",
         venv,
         n_steps=settings.n_steps,
-        batch_size=settings.n_envs * settings.n_steps // settings.n_minibatches,
+        batch_size=settings.rollout // settings.n_minibatches,
         n_epochs=settings.n_epochs,
         policy_kwargs={"lstm_hidden_size": settings.policy.hidden_size, "net_arch": {"pi": heads, "vf": heads}},
         seed=seed,

@@ -1,18 +1,19 @@
-"""Test policies that were trained with the paper's own recipe, and others beside them; writes a table.
+"""Test policies that were trained with the paper's own recipe, and others beside them; writes a table and curves.
 
 Usage: python scripts/measure_paper_recipe.py RUNS [--cases 500] [--out data/results/paper_recipe.csv]
-    [--figure data/images/paper_recipe.png]
+    [--curves data/results/paper_recipe_curves.csv] [--figure data/images/paper_recipe_curves.png]
 
 RUNS is a folder of training runs BUDGET.METHOD.SEED, such as ``tint-sumo policy train --method oracle --budget paper
 --p-conservative 0.4 --seed 0 --out RUNS/paper.oracle.0`` makes; with BUDGET "full" they have our recipe. Each policy is
-tested in the mix that it was trained for, after 25, 50 and 100 % of its training. Rows that the table has already of
-other trainings are kept, so trainings can be made one by one. With --figure, the curves of those in RUNS are drawn.
+tested in the mix that it was trained for, after 25, 50 and 100 % of its training. Table and curves keep the rows that
+they have already of other trainings, so trainings can be made one by one. With --figure, all curves are drawn.
 """
 
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pandas
 from matplotlib.figure import Figure
 
@@ -26,9 +27,10 @@ from tint_sumo.policy.storage import card_file, read_policy_card
 from tint_sumo.study.published import RATES_PERCENT
 
 LOOKS = {"paper": ("#1793fc", "the paper's recipe"), "full": ("#d77e0b", "our recipe")}
-KEY = ["budget", "method", "p_conservative", "seed", "percent"]  # columns that tell rows apart
+TRAINING = ["budget", "method", "p_conservative", "seed"]  # columns that tell trainings apart
 LINES = {"success": "-", "collision": ":"}
-POINTS = 400  # of a curve
+POINTS = 200  # of a curve
+COLUMNS = 3  # panels in a row of the figure
 
 
 def finished(runs: Path) -> Iterator[tuple[str, Path]]:
@@ -61,27 +63,53 @@ def rows_of(budget: str, folder: Path, cases: int) -> Iterator[dict[str, object]
         }
 
 
+def curve_of(budget: str, folder: Path) -> pandas.DataFrame:
+    """Return some points of a training's curve: outcomes in percent of the last 500 episodes."""
+    card = read_policy_card(snapshot_stem(folder, 100))
+    curve = pandas.read_csv(folder / CURVE_FILE)
+    curve = curve.iloc[np.linspace(0, len(curve) - 1, min(POINTS, len(curve))).round().astype(int)]
+    table = pandas.DataFrame(
+        {
+            "budget": budget,
+            "method": card["method"],
+            "p_conservative": float(card["p_conservative"][0]),
+            "seed": card["seed"],
+            "decisions": curve["decisions"],
+        }
+    )
+    for outcome in BUILT_IN_OUTCOMES:
+        table[f"{outcome}_percent"] = (100 * curve[outcome]).round(1)
+    return table
+
+
 def with_kept(table: pandas.DataFrame, out: Path) -> pandas.DataFrame:
     """Return a table with the rows that ``out`` has already of other trainings."""
     if out.exists():
-        table = pandas.concat([pandas.read_csv(out), table])
-    return table.drop_duplicates(KEY, keep="last").sort_values(KEY, ignore_index=True)
+        kept = pandas.read_csv(out)
+        measured = pandas.MultiIndex.from_frame(table[TRAINING])
+        table = pandas.concat([kept[~pandas.MultiIndex.from_frame(kept[TRAINING]).isin(measured)], table])
+    return table.sort_values(TRAINING, ignore_index=True, kind="stable")
 
 
-def plot(runs: Path, file: Path) -> None:
-    """Draw success and collisions of the last 500 episodes in training against the simulated time."""
-    figure = Figure(figsize=(7.5, 4.2), dpi=150, layout="constrained")
-    axes = figure.subplots()
-    for budget, folder in finished(runs):
-        curve = pandas.read_csv(folder / CURVE_FILE)
-        curve = curve.iloc[:: max(len(curve) // POINTS, 1)]
-        hours = curve["decisions"] * PPO_BUDGETS[budget].action_repeat * STEP_S / 3600.0
-        colour, title = LOOKS[budget]
-        for outcome, line in LINES.items():
-            axes.plot(hours, 100 * curve[outcome], line, color=colour, lw=1.2, label=f"{title}: {outcome}")
-    axes.set(xlabel="simulated time (hours)", ylabel="last 500 episodes in training (%)", ylim=(0, 100))
-    axes.grid(alpha=0.25)
-    axes.legend(frameon=False, fontsize=8)
+def plot(curves: pandas.DataFrame, file: Path) -> None:
+    """Draw success and collisions in training against the simulated time, one panel for each method and mix."""
+    panels = list(curves.groupby(["method", "p_conservative"], sort=False))
+    columns, lines = min(len(panels), COLUMNS), -(-len(panels) // COLUMNS)
+    figure = Figure(figsize=(4.2 * columns, 3.6 * lines), dpi=150, layout="constrained")
+    all_axes = figure.subplots(lines, columns, sharey=True, squeeze=False).flat
+    for axes in all_axes[len(panels) :]:
+        axes.set_visible(False)
+    for axes, ((method, p_conservative), found) in zip(all_axes, panels, strict=False):
+        for (budget, _), curve in found.groupby(["budget", "seed"], sort=False):
+            hours = curve["decisions"] * PPO_BUDGETS[budget].action_repeat * STEP_S / 3600.0
+            colour, title = LOOKS[budget]
+            for outcome, line in LINES.items():
+                label = f"{title}: {outcome}"
+                axes.plot(hours, curve[f"{outcome}_percent"], line, color=colour, lw=1.2, label=label)
+        axes.set(title=f"{method}, P {p_conservative:g}", xlabel="simulated time (hours)", ylim=(0, 100))
+        axes.grid(alpha=0.25)
+        axes.legend(frameon=False, fontsize=8)
+    figure.axes[0].set_ylabel("last 500 episodes in training (%)")
     with whole_file(file) as partial:
         figure.savefig(partial, format="png")
     print(f"wrote {file}")
@@ -92,17 +120,23 @@ def main() -> None:
     parser.add_argument("runs", type=Path)
     parser.add_argument("--cases", type=int, default=500)
     parser.add_argument("--out", type=Path, default=Path("data/results/paper_recipe.csv"))
+    parser.add_argument("--curves", type=Path, default=Path("data/results/paper_recipe_curves.csv"))
     parser.add_argument("--figure", type=Path)
     given = parser.parse_args()
-    rows = []
+    rows, curves = [], []
     for budget, folder in finished(given.runs):
+        curves.append(curve_of(budget, folder))
         for row in rows_of(budget, folder, given.cases):
             rows.append(row)
             print(*row.values(), flush=True)
+    if not rows:
+        parser.error(f"{given.runs} has no finished training BUDGET.METHOD.SEED")
     write_frame(with_kept(pandas.DataFrame(rows), given.out), given.out)
-    print(f"wrote {given.out}")
+    every_curve = with_kept(pandas.concat(curves), given.curves)
+    write_frame(every_curve, given.curves)
+    print(f"wrote {given.out}", f"wrote {given.curves}", sep="\n")
     if given.figure is not None:
-        plot(given.runs, given.figure)
+        plot(every_curve, given.figure)
 
 
 if __name__ == "__main__":

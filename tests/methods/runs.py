@@ -17,5 +17,5 @@ SETTINGS = PpoSettings(
 )
 
 if __name__ == "__main__":
-    training.CHECKPOINT_INTERVAL_S = 0.0
+    training.CHECKPOINT_INTERVAL_S = training.STATE_INTERVAL_S = 0.0
     training.train_policy(METHOD, Mix(0.4), STEPS, SEED, Path(sys.argv[1]), settings=SETTINGS)

@@ -1,4 +1,5 @@
 import json
+import math
 import os
 import random
 import re
@@ -7,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +33,7 @@ from tint_sumo.core.progress import Progress, Report
 from tint_sumo.core.structures import plain
 from tint_sumo.envs import TaskSettings
 from tint_sumo.films.training_films import film_policy
+from tint_sumo.methods import training
 from tint_sumo.methods.evaluation import CASE_SEED, evaluate
 from tint_sumo.methods.loading import load_policy
 from tint_sumo.methods.training import CURVE_FILE, ZIP_FILE, share_training, train_policy
@@ -185,6 +187,13 @@ def test_decisions_can_last_several_steps(tmp_path: Path, tiny: PpoSettings) -> 
 # Interruptions
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _every_rollout_can_be_gone_on_from() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(training, "STATE_INTERVAL_S", 0.0)
+        yield
+
+
 def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path, brief: PpoSettings) -> None:
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
@@ -243,6 +252,22 @@ def test_an_interrupted_run_ends_with_the_very_same_policy(method: str, tmp_path
             train(resumed, report=interrupt_at(steps), film=look)
         torch.manual_seed(steps)  # another process has other random numbers
     train(resumed, report=draw, film=look)
+    assert_same_training(resumed, at_a_stretch)
+
+
+def test_a_run_that_repeats_rollouts_ends_with_the_very_same_policy(
+    tmp_path: Path, brief: PpoSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The state of the training is not kept at each of many short rollouts."""
+    monkeypatch.setattr(training, "STATE_INTERVAL_S", math.inf)
+    at_a_stretch, resumed = tmp_path / "at_a_stretch", tmp_path / "resumed"
+    train = partial(train_policy, "oracle", Mix(0.4), 512, 0, settings=brief)
+    train(at_a_stretch)
+    with pytest.raises(KeyboardInterrupt):
+        train(resumed, report=interrupt_at(384))
+    reports: list[Progress] = []
+    train(resumed, report=reports.append)
+    assert reports[0].done == 0
     assert_same_training(resumed, at_a_stretch)
 
 

@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import io
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -45,6 +46,7 @@ from tint_sumo.traits.storage import read_card, require_scene, save
 FilmMaker = Callable[[Path], bytes | None]  # a GIF of the policy in a file; None where there can be none
 
 CHECKPOINT_INTERVAL_S = 15.0
+STATE_INTERVAL_S = 1.0  # an interrupted training loses as much work; making the state takes up to 30 ms
 POLICY = "policy"  # name of the policy in the folder of a run
 ZIP_FILE = "policy.zip"
 CURVE_FILE = "curve.csv"
@@ -324,7 +326,8 @@ def _training_seed(seed: int) -> int:
 class _Watch(BaseCallback):
     """Keeps checkpoints, snapshots and the curve of the training, and reports the outcomes of recent episodes.
 
-    A checkpoint is the state between two rollouts: within one, steps are counted from which nothing is learnt yet.
+    A checkpoint is the state between two rollouts: within one, steps are counted from which nothing is learnt yet. So
+    it is made before it is known whether it will be needed, but not before each of many short rollouts.
     """
 
     def __init__(
@@ -346,6 +349,7 @@ class _Watch(BaseCallback):
         self._report = report
         self._recent: deque[str] = deque(recent, maxlen=RECENT_EPISODES)
         self._saved_at = time.monotonic()
+        self._made_at = -math.inf
         self._state = b""
         self._curve: list[list[str]] = []
 
@@ -356,7 +360,9 @@ class _Watch(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         assert isinstance(self.model, RecurrentPPO)
-        self._state = make_checkpoint(self.model, self._recent)
+        if time.monotonic() - self._made_at >= STATE_INTERVAL_S:
+            self._state = make_checkpoint(self.model, self._recent)
+            self._made_at = time.monotonic()
         if time.monotonic() - self._saved_at >= CHECKPOINT_INTERVAL_S:
             self.write_checkpoint()
             self._saved_at = time.monotonic()

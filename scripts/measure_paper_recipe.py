@@ -10,8 +10,9 @@ they have already of other trainings, so trainings can be made one by one. With 
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas
@@ -41,6 +42,12 @@ def finished(runs: Path) -> Iterator[tuple[str, Path]]:
             yield budget, folder
 
 
+def training_of(budget: str, card: Mapping[str, Any]) -> dict[str, object]:
+    """Return the entries that tell a training apart from others."""
+    values = (budget, card["method"], float(card["p_conservative"][0]), card["seed"])
+    return dict(zip(TRAINING, values, strict=True))
+
+
 def rows_of(budget: str, folder: Path, cases: int) -> Iterator[dict[str, object]]:
     """Yield a row for each part of a training: rates in percent with intervals, and those of the paper."""
     for percent in (*SNAPSHOTS_PERCENT, 100):
@@ -52,10 +59,7 @@ def rows_of(budget: str, folder: Path, cases: int) -> Iterator[dict[str, object]
         published = RATES_PERCENT.get((method, p_conservative), ()) if budget == "paper" else ()
         names = [f"published_{outcome}_percent" for outcome in BUILT_IN_OUTCOMES]
         yield {
-            "budget": budget,
-            "method": method,
-            "p_conservative": p_conservative,
-            "seed": card["seed"],
+            **training_of(budget, card),
             "percent": percent,
             "decisions": card.get("decisions", card["steps"]),
             **{name: value for name, value in shares.items() if name != "world"},
@@ -68,15 +72,7 @@ def curve_of(budget: str, folder: Path) -> pandas.DataFrame:
     card = read_policy_card(snapshot_stem(folder, 100))
     curve = pandas.read_csv(folder / CURVE_FILE)
     curve = curve.iloc[np.linspace(0, len(curve) - 1, min(POINTS, len(curve))).round().astype(int)]
-    table = pandas.DataFrame(
-        {
-            "budget": budget,
-            "method": card["method"],
-            "p_conservative": float(card["p_conservative"][0]),
-            "seed": card["seed"],
-            "decisions": curve["decisions"],
-        }
-    )
+    table = pandas.DataFrame({**training_of(budget, card), "decisions": curve["decisions"]})
     for outcome in BUILT_IN_OUTCOMES:
         table[f"{outcome}_percent"] = (100 * curve[outcome]).round(1)
     return table

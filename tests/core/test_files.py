@@ -87,6 +87,9 @@ def test_one_process_at_a_time_works_in_a_folder_even_if_the_other_one_is_killed
 
 def test_leftovers_of_a_killed_run_do_not_stand_in_the_way(tmp_path: Path) -> None:
     (tmp_path / ".run.json.123.partial").write_text("half")
+    half_folder = tmp_path / ".exported.123.partial"
+    half_folder.mkdir()
+    (half_folder / ".policy.json.123.partial").write_text("half")
     claim(tmp_path, {"seed": 1})
     assert read_json(tmp_path / "run.json", "run") == {"seed": 1}
     assert not list(tmp_path.glob(".*.partial"))

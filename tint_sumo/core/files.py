@@ -213,9 +213,9 @@ def _nearest_entry(path: Path) -> Path:
 def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bool = True) -> Iterator[None]:
     """Reserve ``folder`` in the block for the run described by ``settings``, a new run or that very run resumed.
 
-    One process at a time may work there; temporary files that killed processes left are removed. A new run that a
-    command begins gets provenance.json and config.yaml, which describe the command; the runs that are parts of it
-    do not. They are no part of what the run is: another command line may resume it.
+    One process at a time may work there; temporary files and folders that killed processes left are removed. A new
+    run that a command begins gets provenance.json and config.yaml, which describe the command; the runs that are parts
+    of it do not. They are no part of what the run is: another command line may resume it.
 
     Args:
         folder: of the run.
@@ -232,8 +232,8 @@ def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bo
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder, f"another process is working in {folder}; wait for it or choose another `out`"):
         _require_home(folder, wanted)
-        for partial in folder.rglob(".*.partial"):
-            partial.unlink(missing_ok=True)
+        for partial in list(folder.rglob(".*.partial")):
+            _remove(partial)
         if not (folder / RUN_FILE).exists():
             _write_provenance(folder, with_versions)
             write_json(folder / RUN_FILE, wanted)
@@ -257,6 +257,14 @@ def locked(folder: Path, refusal: str) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def _remove(entry: Path) -> None:
+    """Remove a file, or a folder with all that is in it; neither need be there."""
+    if entry.is_dir() and not entry.is_symlink():
+        shutil.rmtree(entry)
+    else:
+        entry.unlink(missing_ok=True)
 
 
 def _require_home(folder: Path, wanted: Mapping[str, Any]) -> None:

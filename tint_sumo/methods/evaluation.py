@@ -1,7 +1,7 @@
 """Evaluation of policies on unseen cases, which are the same for every method."""
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import astuple, dataclass
 from typing import Annotated, Any
@@ -138,17 +138,14 @@ def evaluate(
     """
     require_cases(episodes, case_set, first)
     cases: dict[int, Case] = {}
+    ends: Counter[str] = Counter()
     with closing(drive(policy, make_venv, case_seed(case_set, first), episodes, batch)) as all_driven:
         for driven in all_driven:
-            cases[driven.number] = _case(driven)
-            report(Progress(len(cases), episodes, "case", _shares(cases.values())))
+            case = cases[driven.number] = _case(driven)
+            ends[case.outcome] += 1
+            shares = {outcome: ends[outcome] / len(cases) for outcome in ("success", "collision")}
+            report(Progress(len(cases), episodes, "case", shares))
     return Evaluation(tuple(cases[number] for number in range(episodes)))
-
-
-def _shares(cases: Collection[Case]) -> dict[str, float]:
-    """Return the shares of outcomes in the cases so far."""
-    ends = Counter(case.outcome for case in cases)
-    return {outcome: ends[outcome] / len(cases) for outcome in ("success", "collision")}
 
 
 def _case(driven: DrivenEpisode) -> Case:

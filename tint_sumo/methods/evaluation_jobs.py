@@ -16,7 +16,9 @@ from tint_sumo.envs import TaskSettings
 from tint_sumo.jobs import Executor
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
 from tint_sumo.methods.evaluation import BATCH, Case, Evaluation, StoredCase, evaluate, require_cases
-from tint_sumo.methods.loading import load_policy
+from tint_sumo.methods.loading import find_policy, load_policy
+from tint_sumo.methods.registry import METHODS, Rule
+from tint_sumo.methods.training import TRAITS
 
 MAX_CASES = 1000  # cases of a job: some 20 seconds' work is lost with a machine
 _MODEL = "model"  # folder of the policy's files
@@ -34,7 +36,7 @@ class _Cases:
 class CasesJob:
     """Evaluate a policy on the cases ``first``, ``first + 1``, ... of a case set."""
 
-    model: str  # a name, or a path in ``out``
+    model: str  # name of a rule, or path in ``out`` of a policy's file
     allow_pickle: bool
     task: TaskSettings
     case_set: int
@@ -63,8 +65,8 @@ class CasesJob:
 
     def run(self, report: Report) -> str:
         torch.set_num_threads(THREADS_PER_JOB)
-        placed = self.out / self.model
-        model = placed if placed.exists() else self.model
+        copied = self.out / self.model
+        model = copied if copied.exists() else self.model
         contender = load_policy(model, scene=self.task.scene, allow_pickle=self.allow_pickle)
         evaluation = evaluate(
             contender.policy,
@@ -92,7 +94,7 @@ def evaluate_on(
     allow_pickle: bool = False,
     progress: bool = True,
 ) -> Evaluation:
-    """``evaluate`` a policy with an executor; case by case, the outcome is the same.
+    """Evaluate a policy with an executor; each case has the same outcome as with ``evaluate``.
 
     Args:
         executor: where it is done.
@@ -122,12 +124,13 @@ def evaluate_on(
 
 
 def _copy_model(model: str, out: Path) -> str:
-    """Copy a policy's files, and those beside it that it may need; return its path there."""
-    given = Path(model)
-    if not given.exists():
+    """Copy the files of the policy that ``load_policy`` finds, and its trait model; return its path, a rule's name."""
+    if isinstance(METHODS.get(model), Rule):
         return model
+    zipped = Path(model).suffix == ".zip"
+    stem = Path(model).with_suffix("") if zipped else find_policy(model)
     (out / _MODEL).mkdir()
-    for file in (given if given.is_dir() else given.parent).iterdir():
-        if file.suffix in _SUFFIXES and file.is_file():
+    for file in stem.parent.iterdir():
+        if file.stem in (stem.name, TRAITS) and file.suffix in _SUFFIXES and file.is_file():
             shutil.copy(file, out / _MODEL)
-    return _MODEL if given.is_dir() else f"{_MODEL}/{given.name}"
+    return f"{_MODEL}/{stem.name}{'.zip' if zipped else '.safetensors'}"

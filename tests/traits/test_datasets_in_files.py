@@ -20,7 +20,7 @@ from tint_sumo.core.files import write_json
 from tint_sumo.dataset.schema import MANIFEST, SCHEMA_VERSION
 from tint_sumo.dataset.shards import write_tables
 from tint_sumo.dataset.windows import WindowFile, Windows, count_windows, window_file
-from tint_sumo.traits import TRAIT_METHODS, datasets, training
+from tint_sumo.traits import TRAIT_METHODS, datasets
 from tint_sumo.traits.datasets import train_traits
 from tint_sumo.traits.storage import read_card
 
@@ -91,7 +91,6 @@ def test_an_interrupted_training_ends_with_the_very_same_model_wherever_its_wind
         train_traits(data, tmp_path / out, settings=SMALL, streaming=streaming)
 
     run("whole", streaming=True)
-    monkeypatch.setattr(training, "CHECKPOINT_INTERVAL_S", 0.0)
     with monkeypatch.context() as interrupted, pytest.raises(KeyboardInterrupt):
         interrupt_at_step(interrupted, 7)  # an epoch has five
         run("broken", streaming=True)

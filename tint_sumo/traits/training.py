@@ -135,7 +135,7 @@ class _Run:
         )
 
     def fit(self, out: Path, report: Report) -> dict[str, float]:
-        """Run all epochs, beginning after those in the checkpoint in ``out``; the mean loss terms of the last epoch.
+        """Run all epochs, beginning after those in the checkpoint in ``out``; return the mean loss terms of the last.
 
         Each epoch draws from another generator, so a checkpoint needs no generator states.
         """
@@ -152,6 +152,9 @@ class _Run:
         for epoch in range(done, self.settings.epochs):
             try:
                 loss = self._run_epoch(epoch, report)
+            except KeyboardInterrupt:
+                write_checkpoint(out, state)
+                raise
             except DivergedError as error:
                 write_checkpoint(out, state)
                 raise DivergedError(f"{error}; the checkpoint in {out} holds the model of {epoch} epochs") from None

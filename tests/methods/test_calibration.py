@@ -10,8 +10,9 @@ from torch import nn
 
 from tests.methods import runs
 from tests.simulation.scenes import T
-from tint_sumo.config import Mix, PpoSettings
+from tint_sumo.config import PERFECT, SENSORS, Mix, PpoSettings
 from tint_sumo.core.determinism import single_threaded
+from tint_sumo.core.errors import InputError
 from tint_sumo.methods.calibration import calibrate
 from tint_sumo.methods.registry import find_learned
 from tint_sumo.methods.training import calibrated, new_model, train_policy, training_venv
@@ -64,17 +65,26 @@ def test_the_result_does_not_depend_on_the_batch(batch: int) -> None:
     assert found[0] == found[1]
 
 
-def test_a_training_ends_with_its_calibration(tmp_path: Path) -> None:
-    settings = replace(runs.SETTINGS, calibration_episodes=4, time_limit_s=5.0)
+@pytest.mark.parametrize("episodes", [2, 4])
+def test_a_training_ends_with_its_calibration(tmp_path: Path, episodes: int) -> None:
+    settings = replace(runs.SETTINGS, n_minibatches=4, calibration_episodes=episodes, time_limit_s=5.0)
     with_it, without = (
         train_policy("no_labels", Mix(0.5), 100, 1, tmp_path / str(used.calibration_episodes), settings=used)
         for used in (settings, replace(settings, calibration_episodes=0))
     )
     policy = load_policy_network(without.with_suffix(""))
     with single_threaded():
-        found = calibrated(policy, environments(0.5, settings), 1, settings)
+        found = calibrated(policy, lambda: environments(0.5, settings)(settings.n_envs), 1, settings)
     card = read_policy_card(with_it.with_suffix(""))
     assert card["calibration"] == {"bias": found.bias, "returns": found.returns}
     assert "calibration" not in read_policy_card(without.with_suffix(""))
     trained = load_policy_network(with_it.with_suffix("")).state_dict()
     assert all(torch.equal(trained[key], value) for key, value in policy.state_dict().items())
+
+
+def test_all_sensors_of_a_training_have_their_share_of_the_calibration(tmp_path: Path) -> None:
+    settings = replace(runs.SETTINGS, calibration_episodes=6)
+    message = r"calibration_episodes must be 0 or a multiple of n_envs \(4\), .* not 6"
+    with pytest.raises(InputError, match=message):
+        train_policy("no_labels", Mix(0.5), 64, 0, tmp_path, settings=settings, sensors=[PERFECT, SENSORS["range_15"]])
+    assert not list(tmp_path.iterdir())

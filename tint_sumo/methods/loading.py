@@ -8,15 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from tint_sumo import traits
 from tint_sumo.config import LATENT_SIZE, PERFECT, Mix, PpoSettings, Sensor, Traffic
 from tint_sumo.core.determinism import preserved_random_state
-from tint_sumo.core.errors import InputError, NotFiniteError
+from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
 from tint_sumo.core.structures import build
 from tint_sumo.envs import TaskSettings
@@ -25,13 +22,10 @@ from tint_sumo.methods.registry import METHODS, Learned, Policy, Rule, find_lear
 from tint_sumo.methods.rules import ACTIONS as RULE_ACTIONS
 from tint_sumo.methods.training import POLICY, TRAITS, digest
 from tint_sumo.policy import GruPolicy, RecurrentPPO, TraitSource
-from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, weights_file
+from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, require_finite, weights_file
 from tint_sumo.policy.wrappers import OnStep, policy_venv
 from tint_sumo.scenes import ALL_SCENES, SCENES, AnyScene, SumocfgScene, find_scene, paper_scene, read_described
 from tint_sumo.traits import TraitModel
-
-_PROBES = 16  # observations for which a policy's outputs must be finite
-_FAR = 10.0  # end of the range of traits, which have no bounds
 
 
 @dataclass(frozen=True)
@@ -151,7 +145,7 @@ def _load_zip(file: Path, allow_pickle: bool) -> RecurrentPPO:
 
 def _contender(stem: Path, policy: GruPolicy | RecurrentPPO) -> Contender:
     card = _checked_card(stem)
-    _require_finite(stem, policy if isinstance(policy, GruPolicy) else policy.policy)
+    require_finite(policy if isinstance(policy, GruPolicy) else policy.policy, weights_file(stem))
     learned = find_learned(card["method"])
     encoder = None if learned.encoder is None else _load_encoder(stem, card)
     observed = _observation_settings(card["settings"])
@@ -165,31 +159,6 @@ def _contender(stem: Path, policy: GruPolicy | RecurrentPPO) -> Contender:
         int(card["settings"]["action_repeat"]),
         learned.name,
     )
-
-
-@torch.no_grad()
-def _require_finite(stem: Path, policy: GruPolicy) -> None:
-    """Raise NotFiniteError if finite weights give outputs that are not, for observations at the ends of their ranges.
-
-    A training with too high a learning rate can end with such weights.
-    """
-    assert isinstance(policy.observation_space, spaces.Dict)
-    rng = np.random.default_rng(0)
-    limits = {key: np.minimum(part.high, _FAR) for key, part in policy.observation_space.spaces.items()}  # type: ignore[attr-defined]
-    policy.set_training_mode(False)
-    try:
-        for count in (1,) * _PROBES + (_PROBES,):  # whether sums overflow depends on the size of the batch, too
-            drawn = {key: rng.choice([-1.0, 1.0], (count, *limit.shape)) * limit for key, limit in limits.items()}
-            tensors, _ = policy.obs_to_tensor({key: array.astype(np.float32) for key, array in drawn.items()})
-            starts = torch.ones(count, device=policy.device)
-            _, values, _, _ = policy(tensors, policy.initial_states(count), starts, deterministic=True)
-            if not values.isfinite().all():
-                raise FloatingPointError
-    except FloatingPointError:
-        raise NotFiniteError(
-            f"{weights_file(stem)}: the policy's outputs are not finite, since its weights are too large; "
-            "train it again with a lower learning_rate"
-        ) from None
 
 
 def _load_encoder(stem: Path, card: dict[str, Any]) -> TraitModel:

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +107,7 @@ def train_policy(
 
     Raises:
         InputError: bad values, no such method or trait model, ``out`` holds another run, or its checkpoint is damaged.
-        DivergedError: a loss or a weight is not finite; the checkpoint is of before that.
+        DivergedError: a loss, a weight or an output of the policy is not finite; the same call ends so again.
     """
     learned = find_learned(method)
     scenes = find_scenes(scene)
@@ -122,10 +122,15 @@ def train_policy(
     if encoder is not None and not other_scene:
         require_scene(traits or str(learned.encoder), trained_in["scene"], trained_in["scene_digest"], "the policy")
     settings = learned.settings_of(settings)
-    if len(scenes) * len(sensors) > settings.n_envs:
+    places = len(scenes) * len(sensors)
+    if places > settings.n_envs:
         raise InputError(
-            f"n_envs must be at least {len(scenes) * len(sensors)}, an environment for each scene and sensor, not "
-            f"{settings.n_envs}"
+            f"n_envs must be at least {places}, an environment for each scene and sensor, not {settings.n_envs}"
+        )
+    if places > 1 and settings.calibration_episodes % settings.n_envs:
+        raise InputError(
+            f"calibration_episodes must be 0 or a multiple of n_envs ({settings.n_envs}), so that all scenes and "
+            f"sensors have their share, not {settings.calibration_episodes}"
         )
     if scenes[0].sumocfg and settings.n_envs > _MOST_SIMULATIONS:
         raise InputError(
@@ -155,19 +160,17 @@ def train_policy(
                 save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)).entries)
             card = _card(identity, encoder)
 
-            def make_venv(num_envs: int) -> VecEnv:
-                some = replace(settings, n_envs=num_envs)
-                return training_venv(learned, encoder, p_conservative, some, scenes, sensors)
+            def make_venv() -> VecEnv:
+                return training_venv(learned, encoder, p_conservative, settings, scenes, sensors)
 
             with preserved_random_state(), single_threaded():
-                with closing(make_venv(settings.n_envs)) as venv:
+                with closing(make_venv()) as venv:
                     model = _learn(venv, outcomes_in(scenes[0]), steps, seed, out, settings, card, film, report)
                 if settings.calibration_episodes:
                     card |= {"calibration": asdict(calibrated(model.policy, make_venv, seed, settings, report))}
             if with_zip:
                 model.save(out / ZIP_FILE)
-            save_policy(model.policy, stem, card)
-            _log_film(model, stem, film)
+            _keep_policy(model, stem, card, film)
             remove_checkpoint(out)
         return stem.with_suffix(".safetensors")
 
@@ -269,31 +272,37 @@ def _learn(
             raise
         except DivergedError as error:
             watch.write_checkpoint()
-            raise DivergedError(f"{error}; the checkpoint in {out} holds the last finite policy") from None
+            raise DivergedError(f"{error}; {out} holds a checkpoint of before that") from None
     return model
 
 
 def calibrated(
-    policy: GruPolicy, make_venv: Callable[[int], VecEnv], seed: int, settings: PpoSettings, report: Report = silent
+    policy: GruPolicy, make_venv: Callable[[], VecEnv], seed: int, settings: PpoSettings, report: Report = silent
 ) -> Calibration:
-    """Calibrate a policy at the end of its training, in episodes that the training has not had."""
+    """Calibrate a policy at the end of its training, in episodes that the training has not had.
+
+    ``make_venv`` makes the environments of the training, all of them, so that each scene and sensor has its share.
+    """
     first_seed = CASE_SEED // 2 + _training_seed(seed) // 2
-    return calibrate(policy, make_venv, first_seed, settings.calibration_episodes, settings.n_envs, report)
+    return calibrate(policy, lambda _: make_venv(), first_seed, settings.calibration_episodes, settings.n_envs, report)
 
 
-def _log_film(model: BaseAlgorithm, stem: Path, film: FilmMaker | None) -> None:
-    """Log a film of the policy that has just been kept.
+def _keep_policy(model: BaseAlgorithm, stem: Path, card: Mapping[str, Any], film: FilmMaker | None) -> None:
+    """Write the policy as it is now, and log a film of it.
 
     Raises:
-        DivergedError: the policy's outputs are not finite in the film.
+        DivergedError: its outputs are not finite; it is not kept then.
     """
+    assert isinstance(model.policy, GruPolicy)
     try:
+        save_policy(model.policy, stem, card)
         gif = None if film is None else film(weights_file(stem))
     except NotFiniteError:
-        problem = (
-            f"the training diverged at step {model.num_timesteps}: the policy's outputs in its film are not finite"
-        )
-        raise DivergedError(f"{problem}; choose a lower learning_rate") from None
+        card_file(stem).unlink(missing_ok=True)  # so that the same command comes to the same end
+        raise DivergedError(
+            f"the training diverged at step {model.num_timesteps}: the policy's outputs are not finite; "
+            "choose a lower learning_rate"
+        ) from None
     if gif is not None:
         log_film(model.logger, "film", gif, model.num_timesteps)
 
@@ -372,9 +381,8 @@ class _Watch(BaseCallback):
         for percent in SNAPSHOTS_PERCENT:
             stem = snapshot_stem(self._out, percent)
             if self.num_timesteps * 100 >= percent * self._steps and not card_file(stem).exists():
-                assert isinstance(self.model.policy, GruPolicy)
-                save_policy(self.model.policy, stem, {**self._card, "decisions": self.num_timesteps})
-                _log_film(self.model, stem, self._film)
+                card = {**self._card, "decisions": self.num_timesteps}
+                _keep_policy(self.model, stem, card, self._film)
 
     def write_checkpoint(self) -> None:
         """Write the state at the start of the present rollout, if there is one."""

@@ -8,12 +8,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import torch
 from gymnasium import spaces
 from torch import Tensor
 
 from tint_sumo.config import Perceivable, PolicySettings, Slots
 from tint_sumo.core.determinism import preserved_random_state
-from tint_sumo.core.errors import InputError
+from tint_sumo.core.errors import InputError, NotFiniteError
 from tint_sumo.core.files import read_json, write_json
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import FieldError, build
@@ -25,6 +27,8 @@ from tint_sumo.policy.trait_sources import OracleTraits
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS, trait_space
 
 _NETWORK = "network"  # the card's entry with all that is needed to build the network
+_PROBES = 16  # observations for which a policy's outputs must be finite
+_FAR = 10.0  # end of the range of traits, which have no bounds
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,11 @@ def save_policy(policy: GruPolicy, stem: Path, card: Mapping[str, Any]) -> None:
         policy: for observations of a scene with traits.
         stem: path without suffix.
         card: further entries: method, training, results.
+
+    Raises:
+        NotFiniteError: its outputs are not finite; nothing is written then.
     """
+    require_finite(policy, weights_file(stem))
     space = policy.observation_space
     assert isinstance(space, spaces.Dict) and isinstance(policy.action_space, spaces.Discrete)
     traits_shape = space[TRAITS].shape
@@ -85,6 +93,31 @@ def load_policy_network(stem: Path) -> GruPolicy:
     policy.load_state_dict(weights, strict=False)  # the extractor has other names, too
     policy.set_training_mode(False)
     return policy.requires_grad_(False)
+
+
+@torch.no_grad()
+def require_finite(policy: GruPolicy, file: Path) -> None:
+    """Raise NotFiniteError if finite weights give outputs that are not, for observations at the ends of their ranges.
+
+    A training with too high a learning rate can end with such weights. ``file`` is that of the weights.
+    """
+    assert isinstance(policy.observation_space, spaces.Dict)
+    rng = np.random.default_rng(0)
+    limits = {key: np.minimum(part.high, _FAR) for key, part in policy.observation_space.spaces.items()}  # type: ignore[attr-defined]
+    policy.set_training_mode(False)
+    try:
+        for count in (1,) * _PROBES + (_PROBES,):  # whether sums overflow depends on the size of the batch, too
+            drawn = {key: rng.choice([-1.0, 1.0], (count, *limit.shape)) * limit for key, limit in limits.items()}
+            tensors, _ = policy.obs_to_tensor({key: array.astype(np.float32) for key, array in drawn.items()})
+            starts = torch.ones(count, device=policy.device)
+            _, values, _, _ = policy(tensors, policy.initial_states(count), starts, deterministic=True)
+            if not values.isfinite().all():
+                raise FloatingPointError
+    except FloatingPointError:
+        raise NotFiniteError(
+            f"{file}: the policy's outputs are not finite, since its weights are too large; "
+            "train it again with a lower learning_rate"
+        ) from None
 
 
 def _weights_once(policy: GruPolicy) -> dict[str, Tensor]:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pandas
@@ -13,6 +14,7 @@ from tint_sumo.cli import main
 from tint_sumo.config import RelativeSettings
 from tint_sumo.core.files import write_text
 from tint_sumo.drivers import fitting
+from tint_sumo.drivers.pairs import Pair
 from tint_sumo.traits import identification
 
 
@@ -60,12 +62,15 @@ def test_relative_traits_are_fitted_and_become_a_budget(tmp_path: Path, capsys: 
 @pytest.fixture(scope="module")
 def tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two encounters of 11 s of each of five drivers."""
-    pairs = [
+    return write_pairs(tmp_path_factory.mktemp("tracks"), encounters(seed=3))
+
+
+def encounters(seed: int) -> list[Pair]:
+    return [
         simulated_pair(z, 2 * driver + number, 111, follower=str(driver))
-        for driver, z in enumerate(population(5, 3))
+        for driver, z in enumerate(population(5, seed))
         for number in range(2)
     ]
-    return write_pairs(tmp_path_factory.mktemp("tracks"), pairs)
 
 
 def test_traits_of_recorded_tracks(
@@ -78,14 +83,26 @@ def test_traits_of_recorded_tracks(
     write_text(config, "budget: {base: quick, epochs: 1}\n")
     train = ["traits", "train", "--tracks", tracks, "--method", "cross_window", "--config", config]
     card = run(capsys, *train, "--out", tmp_path / "model")
-    assert card["recorded"] == {"tracks": tracks.name, "pairs": 10, "drivers": 5}
+    recorded = {"tracks": tracks.name, "recordings": card["recorded"]["recordings"], "pairs": 10, "drivers": 5}
+    assert card["recorded"] == recorded and len(recorded["recordings"]) == 1
     printed = run(
         capsys, "traits", "infer", "--tracks", tracks, "--model", tmp_path / "model", "--out", tmp_path / "table.csv"
     )
     assert (printed["vehicles"], printed["windows"], printed["outside"]) == (5, card["windows"], 0.0)
-    found = run(capsys, "traits", "identify", "--tracks", tracks, "--model", tmp_path / "model")["measures"]
+    identify = ["traits", "identify", "--model", tmp_path / "model", "--tracks"]
+    found = run(capsys, *identify, _others(tmp_path))["measures"]
     assert {one["situation"] for one in found} == {"other encounters"}  # none is long enough to be halved
     assert {one["count"] for one in found if one["group"] == "identified"} == {10}
+    renamed = tmp_path / "renamed"
+    shutil.copytree(tracks, renamed)
+    assert main([str(part) for part in (*identify, renamed)]) == 2
+    assert "has learnt from these recorded drivers" in capsys.readouterr().err
+
+
+def _others(folder: Path) -> Path:
+    """Tracks of five other drivers."""
+    (folder / "others").mkdir()
+    return write_pairs(folder / "others", encounters(seed=4))
 
 
 @pytest.mark.parametrize(

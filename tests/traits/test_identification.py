@@ -108,6 +108,39 @@ def test_likelihoods_take_their_scale_from_the_other_drivers() -> None:
     np.testing.assert_allclose(module._likelihoods(errors_m, driver), expected)
 
 
+def test_a_single_long_encounter_is_not_halved_for_want_of_others(
+    pairs: list[Pair], small: TraitSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_FOLDS", 2)
+    monkeypatch.setattr(module, "_RESAMPLES", 100)
+    monkeypatch.setattr(fitting, "_STARTS", 1)
+    model = TRAIT_METHODS["cross_window"](small).eval()
+    assert isinstance(model, CrossWindow)
+    shorter = [module._cut(pair, 0, 111) for pair in pairs[1:]]
+    found = identify([pairs[0], *shorter], lambda *_: model)
+    assert {one.situation for one in found} == {OTHER}
+    assert all(np.isfinite([one.value, one.low, one.high]).all() for one in found)
+
+
+def test_a_fold_is_measured_by_a_model_that_has_learnt_from_the_other_drivers_alone(
+    pairs: list[Pair], small: TraitSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    followed: list[Pair] = []
+
+    def drawn(_model: object, _population: object, others: list[Pair], *_: object, **__: object) -> list[Pair]:
+        followed.extend(others)
+        return others
+
+    monkeypatch.setattr(module, "_FOLDS", 2)
+    monkeypatch.setattr(module, "_RESAMPLES", 100)
+    monkeypatch.setattr(module, "_LEARNING", small)
+    monkeypatch.setattr(fitting, "_STARTS", 1)
+    monkeypatch.setattr(module, "drawn_pairs", drawn)
+    found = identify(pairs)
+    assert (RANK_ONE, OTHER, LATENTS) in {(one.group, one.situation, one.name) for one in found}
+    assert sorted(pair.name for pair in followed) == sorted(pair.name for pair in pairs)  # each in the other fold alone
+
+
 def test_too_few_drivers_are_refused(pairs: list[Pair]) -> None:
     def nobody(*_: object) -> CrossWindow:
         raise AssertionError

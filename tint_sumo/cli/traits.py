@@ -1,9 +1,9 @@
 """``tint-sumo traits``."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import arg, subcommand
 
@@ -40,6 +40,10 @@ from tint_sumo.core.stores import working_folder
 from tint_sumo.core.structures import plain
 from tint_sumo.core.yaml_files import to_yaml
 
+if TYPE_CHECKING:
+    from tint_sumo.drivers.pairs import Pair
+    from tint_sumo.traits.identification import ModelOf
+
 _NOISE = optional(
     "FLOAT", "Standard deviation of the noise on every position in training, m.", "the budget's, 0 in named budgets"
 )
@@ -52,6 +56,11 @@ _FIT = optional(
     "Fit of the recorded drivers (tint-sumo drivers fit): the model learns from drivers that are drawn from it, behind "
     "the recorded leaders; with --tracks.",
     "the model learns from the recorded drivers themselves",
+)
+_UNSEEN = optional(
+    "MODEL",
+    "Trait model of method cross_window that has learnt from other drivers: its name, folder or .safetensors file.",
+    "one is trained for each fifth of the drivers, from drivers like the others, in some minutes",
 )
 _FCD = optional(
     "PATH",
@@ -300,25 +309,38 @@ class IdentifyTraits(Command):
 
     tracks: Path
     """Recorded tracks, a file or a folder of files, of any format that tracks inspect reads."""
-    model: TraitModelName
+    model: Annotated[str | None, _UNSEEN] = None
     format: TrackFormatName = None
 
     def run(self) -> Outcome:
         from tint_sumo.drivers.pairs import read_pairs
         from tint_sumo.jobs.table import one_job
-        from tint_sumo.traits import load
-        from tint_sumo.traits.cross_window import CrossWindow
-        from tint_sumo.traits.identification import identify, report_text
-        from tint_sumo.traits.inference import infer_recorded
+        from tint_sumo.traits.identification import identify, report_text, train_on_others
 
         use_one_thread()
-        trained = load(self.model)
-        if not isinstance(trained, CrossWindow):
-            raise InputError(f"{self.model} predicts nothing; give a model of method cross_window")
-        infer_recorded(self.tracks, self.model, self.format)  # refuses tracks of other scales
+        pairs = read_pairs(self.tracks, self.format).pairs
+        model_of = train_on_others if self.model is None else self._trained(self.model, pairs)
         with one_job("identify") as report:
-            measures = identify(read_pairs(self.tracks, self.format).pairs, lambda *_: trained, report)
+            measures = identify(pairs, model_of, report)
         return Outcome(report_text(measures), {"measures": [asdict(one) for one in measures]})
+
+    def _trained(self, model: str, pairs: "Sequence[Pair]") -> "ModelOf":
+        """Return the given model for all folds.
+
+        Raises:
+            InputError: it does not predict, knows other scales, or has learnt from these drivers.
+        """
+        from tint_sumo.traits import load
+        from tint_sumo.traits.cross_window import CrossWindow
+        from tint_sumo.traits.inference import infer_recorded
+        from tint_sumo.traits.recorded import require_unseen
+
+        trained = load(model)
+        if not isinstance(trained, CrossWindow):
+            raise InputError(f"{model} predicts nothing; give a model of method cross_window")
+        infer_recorded(self.tracks, model, self.format)  # refuses tracks of other scales
+        require_unseen(model, pairs)
+        return lambda *_: trained
 
 
 @dataclass(frozen=True, kw_only=True)

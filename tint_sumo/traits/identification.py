@@ -12,14 +12,16 @@ An encounter is a driver's way behind one leader (``Pair``). Drivers are split i
 is learnt from the drivers of the others. Intervals are from a bootstrap over drivers.
 """
 
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tint_sumo.config import WINDOW_STEPS
+from tint_sumo.config import TRAIT_BUDGETS, WINDOW_STEPS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.drivers.fitting import Estimate, fit_pair
@@ -28,7 +30,8 @@ from tint_sumo.drivers.pairs import Pair
 from tint_sumo.drivers.population import Population, evidence, fit_population, posterior
 from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.evaluation import encode_windows
-from tint_sumo.traits.recorded import windows_of
+from tint_sumo.traits.recorded import DRAWN, ENCOUNTERS, RECORDED_GAP_M, drawn_pairs, windows_of
+from tint_sumo.traits.training import train
 
 CONSTANT, SUMO, POPULATION, SINGLE, POSTERIOR, WITHOUT, WITH = PREDICTORS = (
     "constant speed",
@@ -55,6 +58,7 @@ _FOLDS, _RESAMPLES = 5, 2_000
 _SEEN = WINDOW_STEPS // 2  # steps of a window from which its rest is predicted
 _SLOW_MPS = 1.0
 _LEAST_TIME_GAP_S = 0.05
+_LEARNING = replace(TRAIT_BUDGETS["quick"], noise_m=0.05)
 
 ModelOf = Callable[[int, Population, Sequence[Pair]], CrossWindow]
 
@@ -73,6 +77,15 @@ class Measure:
 
 
 @dataclass(frozen=True)
+class _Halves:
+    """The halves of the longest encounters of some drivers, one encounter each, and their fits by name."""
+
+    firsts: list[Pair]
+    seconds: list[Pair]
+    fits: dict[str, Estimate]
+
+
+@dataclass(frozen=True)
 class _Observed:
     """Values with the drivers they belong to, by situation and name, from all folds."""
 
@@ -82,13 +95,28 @@ class _Observed:
     blocks: dict[tuple[str, str], list[tuple[Floats, NDArray[np.str_]]]]  # vectors and drivers, by group and name
 
 
-def identify(pairs: Sequence[Pair], model_of: ModelOf, report: Report = silent) -> tuple[Measure, ...]:
+def train_on_others(fold: int, population: Population, pairs: Sequence[Pair]) -> CrossWindow:
+    """Train a model for a fold, on drivers that are drawn from the population of the other folds' drivers.
+
+    Each of them follows some of the other drivers' leaders.
+    """
+    windows, _ = windows_of(drawn_pairs(_MODEL, population, pairs, DRAWN, ENCOUNTERS, seed=fold))
+    with tempfile.TemporaryDirectory(prefix="tint_sumo-") as folder:
+        out = Path(folder) / "model"
+        model = train(windows, _LEARNING, out, method=CrossWindow.method, no_leader_gap_m=RECORDED_GAP_M)
+    assert isinstance(model, CrossWindow)
+    return model
+
+
+def identify(
+    pairs: Sequence[Pair], model_of: ModelOf = train_on_others, report: Report = silent
+) -> tuple[Measure, ...]:
     """Measure what traits of recorded drivers are worth.
 
     Args:
         pairs: encounters, with steps of 0.1 s; those of less than 10 s are left out.
         model_of: returns the trait model for a fold, of its number, the population of the other folds' drivers and
-            their encounters.
+            their encounters. A model that has learnt from the drivers of the fold makes the measures too high.
         report: of the folds done.
 
     Raises:
@@ -102,7 +130,8 @@ def identify(pairs: Sequence[Pair], model_of: ModelOf, report: Report = silent) 
             f"{len(several):,} of {len(names):,} drivers follow several leaders for {MIN_S:g} s; two such drivers of "
             f"{_FOLDS} are needed to identify drivers: give a longer recording"
         )
-    fits = {pair.name: fit_pair(_MODEL, pair) for pair in pairs}
+    fits = _fits(pairs)
+    halves = _halves(pairs)
     fold_of = {name: number % _FOLDS for number, name in enumerate(np.random.default_rng(0).permutation(names))}
     found = _Observed({}, {}, {}, {})
     for fold in range(_FOLDS):
@@ -110,7 +139,10 @@ def identify(pairs: Sequence[Pair], model_of: ModelOf, report: Report = silent) 
         others = [pair for pair in pairs if fold_of[pair.driver] != fold]
         population = fit_population(_MODEL, others, {pair.name: fits[pair.name].log_parameters for pair in others})
         model = model_of(fold, population, others)
-        _observe(found, model, population, pairs, fits, {name for name in names if fold_of[name] == fold})
+        tested = {name for name in names if fold_of[name] == fold}
+        vectors = _vectors(model, pairs, fits)
+        _observe(found, model, population, pairs, fits, vectors, tested)
+        _observe_halves(found, model, population, pairs, halves, vectors[LATENTS], tested)
     report(Progress(_FOLDS, _FOLDS, "fold"))
     return tuple(_measures(found))
 
@@ -132,9 +164,10 @@ def _observe(
     population: Population,
     pairs: Sequence[Pair],
     fits: Mapping[str, Estimate],
+    vectors: Mapping[str, Floats],
     tested: set[str],
 ) -> None:
-    vectors = _vectors(model, pairs, fits)
+    """Look at all encounters of the tested drivers: what do a driver's other encounters tell about each?"""
     driver, recording = (np.array([getattr(pair, name) for pair in pairs]) for name in ("driver", "recording"))
     everywhere = np.full(len(pairs), "")
     for name, values in vectors.items():
@@ -149,7 +182,6 @@ def _observe(
         if name != SPEED:
             left = _without(values, vectors[SPEED])
             found.blocks.setdefault((ICC_LESS_SPEED, name), []).append((left[is_tested], driver[is_tested]))
-    _observe_halves(found, model, population, pairs, vectors[LATENTS], tested)
     known = np.array([fits[pair.name].log_parameters for pair in pairs])
     for number, pair in enumerate(pairs):
         own = [other for other in np.flatnonzero(driver == pair.driver).tolist() if other != number]
@@ -166,28 +198,23 @@ def _observe_halves(
     model: CrossWindow,
     population: Population,
     pairs: Sequence[Pair],
+    halves: _Halves,
     latents: Floats,
     tested: set[str],
 ) -> None:
-    """Look at the longest encounter of each driver: is its second half known by the first halves of all?"""
-    longest = {pair.driver: pair for pair in sorted(pairs, key=lambda pair: pair.rows)}
-    halved = [pair for pair in longest.values() if pair.duration_s > MIN_SAME_S - 1e-6]
-    if not halved:
+    """Look at the longest encounters of the tested drivers: is the second half known by the first halves of all?"""
+    count = len(halves.firsts)
+    if not count:
         return
-    firsts = [_cut(pair, 0, pair.rows // 2) for pair in halved]
-    seconds = [_cut(pair, pair.rows // 2, pair.rows) for pair in halved]
-    fits = {pair.name: fit_pair(_MODEL, pair) for pair in (*firsts, *seconds)}
-    vectors = _vectors(model, [*firsts, *seconds], fits)
-    driver = np.array([pair.driver for pair in halved] * 2)
-    for number, (first, second) in enumerate(zip(firsts, seconds, strict=True)):
+    vectors = _vectors(model, [*halves.firsts, *halves.seconds], halves.fits)
+    driver = np.array([pair.driver for pair in halves.firsts] * 2)
+    for number, (first, second) in enumerate(zip(halves.firsts, halves.seconds, strict=True)):
         if second.driver not in tested:
             continue
-        if len(halved) > 1:
-            for name, values in vectors.items():
-                others = np.arange(len(driver)) < len(halved)
-                hit = _nearest(values, driver, len(halved) + number, others)
-                _note(found, RANK_ONE, SAME, name, second.driver, *hit)
-        fit = fits[first.name].log_parameters
+        for name, values in vectors.items():
+            hit = _nearest(values, driver, count + number, np.arange(len(driver)) < count)
+            _note(found, RANK_ONE, SAME, name, second.driver, *hit)
+        fit = halves.fits[first.name].log_parameters
         seen = evidence(_MODEL, first, population, [fit, population.mean])
         others_latents = latents[[pair.driver != first.driver for pair in pairs]].mean(axis=0)
         parameters = fit, posterior(population, [seen]).log_parameters
@@ -199,6 +226,25 @@ def _note(found: _Observed, group: str, situation: str, name: str, driver: str, 
     if name == LATENTS:
         found.hits.setdefault((group, situation, CHANCE), []).append(chance)
         found.drivers.setdefault((group, situation), []).append(driver)
+
+
+def _halves(pairs: Sequence[Pair]) -> _Halves:
+    """Cut the longest encounter of each driver in two, where it is long enough; none if only one driver's is.
+
+    A single driver would be compared with nobody.
+    """
+    longest = {pair.driver: pair for pair in sorted(pairs, key=lambda pair: pair.rows)}
+    cut = [pair for pair in longest.values() if pair.duration_s > MIN_SAME_S - 1e-6]
+    if len(cut) < 2:
+        return _Halves([], [], {})
+    firsts = [_cut(pair, 0, pair.rows // 2) for pair in cut]
+    seconds = [_cut(pair, pair.rows // 2, pair.rows) for pair in cut]
+    return _Halves(firsts, seconds, _fits([*firsts, *seconds]))
+
+
+def _fits(pairs: Sequence[Pair]) -> dict[str, Estimate]:
+    """Return the fit of each pair, by its name."""
+    return {pair.name: fit_pair(_MODEL, pair) for pair in pairs}
 
 
 def _cut(pair: Pair, first: int, last: int) -> Pair:

@@ -4,6 +4,7 @@ Windows are those of simulated datasets, in the same units: offset along the dri
 drivers are vehicles of a recording, with all the leaders that they follow one after the other.
 """
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +28,8 @@ from tint_sumo.traits.storage import read_card
 from tint_sumo.traits.training import train
 
 RECORDED_GAP_M = REACH_M  # stands for the gap without a leader on roads, where speeds and gaps exceed those of scenes
-_DRAWN, _ENCOUNTERS = 400, 4  # drivers that are drawn from a fit, and the leaders that each of them follows
+_DIGITS = 16  # of a recording's checksum
+DRAWN, ENCOUNTERS = 400, 4  # drivers that are drawn from a fit, and the leaders that each of them follows
 
 
 def windows_of(pairs: Sequence[Pair], no_leader_gap_m: float = RECORDED_GAP_M) -> tuple[Windows, NDArray[np.int64]]:
@@ -86,16 +88,41 @@ def train_on_tracks(
             f"method {method} learns with labels, which recorded tracks do not have; choose another method"
         )
     pairs = read_pairs(tracks, format_name, with_free=fit is None).pairs
-    described = {"tracks": tracks.name, "pairs": len(pairs), "drivers": len({pair.driver for pair in pairs})}
+    described: dict[str, Any] = {
+        "tracks": tracks.name,
+        "recordings": _digests(pairs),
+        "pairs": len(pairs),
+        "drivers": len({pair.driver for pair in pairs}),
+    }
     if fit is not None:
         fitted = read_fitted(fit)
         population = fitted.population.population
-        pairs = tuple(drawn_pairs(fitted.car_following, population, pairs, _DRAWN, _ENCOUNTERS, seed))
-        described |= {"drawn": _DRAWN, "model": fitted.model}
+        pairs = tuple(drawn_pairs(fitted.car_following, population, pairs, DRAWN, ENCOUNTERS, seed))
+        described |= {"drawn": DRAWN, "model": fitted.model}
     windows, _ = windows_of(pairs, no_leader_gap_m)
     card = {"recorded": described}
     train(windows, settings, out, method=method, seed=seed, no_leader_gap_m=no_leader_gap_m, report=report, card=card)
     return read_card(out / "model.safetensors").entries
+
+
+def require_unseen(model: str | Path, pairs: Sequence[Pair]) -> None:
+    """Raise InputError if a trait model has learnt from a recording of these pairs, by its card."""
+    recorded = read_card(model).entries.get("recorded")
+    seen = recorded.get("recordings") if isinstance(recorded, dict) else None
+    if isinstance(seen, list) and any(digest in seen for digest in _digests(pairs)):
+        raise InputError(
+            f"{model} has learnt from these recorded drivers, which would make all measures too high; give `tracks` of "
+            "others, or no `model`: then one is trained for each fifth of the drivers, from the other ones"
+        )
+
+
+def _digests(pairs: Sequence[Pair]) -> list[str]:
+    """Return a checksum of each recording's pairs, whatever its name; stretches without a leader do not count."""
+    found: dict[str, Any] = {}
+    for pair in pairs:
+        if pair.leader:
+            found.setdefault(pair.recording, hashlib.sha256()).update(pair.front_m.tobytes())
+    return [digest.hexdigest()[:_DIGITS] for digest in found.values()]
 
 
 def drawn_pairs(

@@ -1,5 +1,6 @@
 """Model cards in the form of Hugging Face, checked by its own library without a network."""
 
+import json
 from pathlib import Path
 
 import pandas
@@ -62,6 +63,28 @@ def test_folders_of_own_models_have_cards_too_and_can_be_pushed(tmp_path: Path, 
         card = read(tmp_path / folder / "README.md")
         assert card.data.eval_results is None
         assert "has not been measured yet" in card.text
+    assert "Windows of the scene (not noted)" in card.text
     for file in files:
         added = huggingface_hub.CommitOperationAdd(path_in_repo=file.name, path_or_fileobj=file)
         assert added.upload_info.size == file.stat().st_size > 0
+
+
+def test_the_page_of_a_model_of_recorded_drivers_says_so(tmp_path: Path) -> None:
+    model = traits.TRAIT_METHODS["vae"](TraitSettings(), 2)
+    recorded = {"tracks": "motorway.csv", "pairs": 9, "drivers": 5}
+    save(model, tmp_path / "recorded", {"recorded": recorded, "windows": 1200})
+    save(model, tmp_path / "drawn", {"recorded": {**recorded, "drawn": 400, "model": "IDM"}, "windows": 1200})
+    pages = {
+        name: " ".join(export_traits(tmp_path / f"{name}.safetensors", tmp_path / f"{name}_out")[0].read_text().split())
+        for name in ("recorded", "drawn")
+    }
+    assert "1,200 windows of recorded traffic, motorway.csv; 1000 epochs" in pages["recorded"]
+    assert "1,200 windows of 400 drivers drawn from the IDM fit of recorded traffic, motorway.csv;" in pages["drawn"]
+
+
+def test_a_card_without_the_defaults_of_its_settings_has_a_page(tmp_path: Path) -> None:
+    save(traits.TRAIT_METHODS["vae"](TraitSettings(), 2), tmp_path / "mine", {})
+    card = json.loads((tmp_path / "mine.json").read_text())
+    del card["settings"]["epochs"]
+    (tmp_path / "mine.json").write_text(json.dumps(card))
+    assert "1000 epochs" in export_traits(tmp_path / "mine.safetensors", tmp_path / "out")[0].read_text()

@@ -201,13 +201,17 @@ def test_files_of_all_shipped_kinds_act_as_the_policies_do(name: str, tmp_path: 
     require_same(load_policy(name), tmp_path)
 
 
+OF_TRAITS = {"streaming": "means of the latents", "no_labels": "0, always", "relative": "belief that the driver yields"}
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("method", ["streaming", "no_labels", "relative"])
+@pytest.mark.parametrize("method", OF_TRAITS)
 def test_files_of_policies_that_see_motion_act_as_these_do(method: str, tmp_path: Path, tiny: PpoSettings) -> None:
     settings = replace(tiny, motion=True)
     train_policy(method, ALL_MIXES, 64, 0, tmp_path / "run", settings=settings)
     compared = compare(load_policy(tmp_path / "run"), tmp_path / "policy.onnx", episodes=10, batch=10)
-    assert compared.file.file.inputs["traits"]["meaning"].startswith("of each vehicle: speed / 3 m/s")
+    meaning = compared.file.file.inputs["traits"]["meaning"]
+    assert meaning.startswith("of each vehicle: speed / 3 m/s") and OF_TRAITS[method] in meaning.split("; then ")[1]
 
 
 @pytest.mark.long

@@ -209,6 +209,7 @@ def _checked_card(stem: Path) -> dict[str, Any]:
     fits = isinstance(method, Learned) and (_can(Mix.parse, mix) or (mix is None and "scene_settings" in card))
     fits &= isinstance(settings, dict) and isinstance(settings.get("action_repeat"), int)
     fits &= isinstance(settings, dict) and _can(_observation_settings, settings)
+    fits &= "traits" in card and all(isinstance(card.get(name), int) for name in ("steps", "seed"))
     fits &= "scene_settings" in card or str(card.get("scene")) in (*SCENES, ALL_SCENES)
     fits &= _can(partial(build, Sensor), card.get("sensor", {}))
     if not fits or (isinstance(method, Learned) and method.encoder and not _is_file_name(card.get("traits"))):

@@ -9,8 +9,9 @@ from typing import Any
 import yaml
 
 from tint_sumo import __version__
-from tint_sumo.config import WORLDS, Mix
+from tint_sumo.config import WORLDS, Mix, TraitSettings
 from tint_sumo.core.percentages import percent
+from tint_sumo.core.structures import build
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import find_learned
 
@@ -123,7 +124,7 @@ def _drivers(key: str) -> str:
 
 def traits_page(name: str, card: Mapping[str, Any]) -> str:
     """Return README.md of a trait model with this .json card."""
-    data, settings = card.get("data") or {}, card["settings"]
+    data, settings = card.get("data") or {}, build(TraitSettings, card["settings"])
     accuracy = card.get("accuracy_by_noise", {})
     index = [
         _result(
@@ -151,6 +152,11 @@ def traits_page(name: str, card: Mapping[str, Any]) -> str:
     mix = data.get("p_conservative")
     drivers = "" if mix is None else f", whose drivers are conservative with probability {Mix.parse(mix).text}"
     windows = f"{card['windows']:,} windows" if "windows" in card else "Windows"
+    source = f"the scene {data.get('scene', '(not noted)')} in Eclipse SUMO{drivers}"
+    if recorded := card.get("recorded"):
+        source = f"recorded traffic, {recorded['tracks']}"
+        if "drawn" in recorded:
+            source = f"{recorded['drawn']} drivers drawn from the {recorded['model']} fit of {source}"
     return f"""{head}
 # {name}: a model of driver traits
 
@@ -164,8 +170,8 @@ come out.
 
 ## Training
 
-{windows} of the scene {data.get("scene", "(not noted)")} in Eclipse SUMO{drivers}; {settings["epochs"]} epochs, with
-noise of {settings["noise_m"]:g} m on positions, seed {card.get("seed", 0)}. `model.json` has all settings.
+{windows} of {source}; {settings.epochs} epochs, with
+noise of {settings.noise_m:g} m on positions, seed {card.get("seed", 0)}. `model.json` has all settings.
 
 ## Measured
 

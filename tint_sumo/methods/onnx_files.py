@@ -163,7 +163,7 @@ def write_policy(contender: Contender, file: Path) -> None:
     network = PolicySteps(policy, contender.scene, has_traits=not isinstance(source, NoTraits))
     inner = source.inner if isinstance(source, WithMotion) else source
     encoder = steps_of(contender)
-    meaning = "true or other traits, 0 where they are not known" if encoder is None else encoder.meaning
+    meaning = inner.meaning if encoder is None else encoder.meaning
     motion = _MOTION_MEANING if inner is not source else ""
     inputs = network.inputs()
     if TRAITS in inputs:

@@ -50,6 +50,7 @@ class TraitSource(ABC):
     """Source of the traits of N environments' vehicles; ``traits`` is (N, V, size) float32."""
 
     size: int = LATENT_SIZE  # numbers per vehicle
+    meaning: ClassVar[str]  # of the numbers, for the users of an exported policy; of a trait model: TraitSteps.meaning
     needs_tracks: ClassVar[bool] = False  # whether it takes the positions of vehicles on their routes
     traits: np.ndarray
 
@@ -73,6 +74,8 @@ class TraitSource(ABC):
 class NoTraits(TraitSource):
     """Traits are always zero."""
 
+    meaning = "0, always"
+
     def begin(self, frame: Frame) -> None: ...
 
     def advance(self, frame: Frame) -> None: ...
@@ -84,6 +87,8 @@ class OracleTraits(TraitSource):
     Args:
         profiles: their number in the scene's population.
     """
+
+    meaning = "1 at the number of the driver's profile, conservative first, else 0; all 0 where it is not known"
 
     def __init__(self, profiles: int = KINDS) -> None:
         self.size = profiles
@@ -259,6 +264,7 @@ class NeighbourTraits(TraitSource):
     """
 
     size = LATENTS
+    meaning = "belief that the driver yields, from -1 to 1, and how much of what can be known of it is known, 0 to 1"
     needs_tracks = True
 
     def __init__(self, settings: RelativeSettings) -> None:

@@ -30,11 +30,12 @@ from tint_sumo.comparisons.traits_report import plot_noise
 from tint_sumo.config import ALL_MIXES, POPULATIONS, SENSORS, Mix, Sensor, Traffic
 from tint_sumo.core.files import write_json
 from tint_sumo.core.statistics import Rate
+from tint_sumo.core.weights import card_file, weights_file
 from tint_sumo.envs import SceneEnv, TaskSettings
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import Learned, find_method, needed_encoders
 from tint_sumo.methods.training import POLICY
-from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
+from tint_sumo.policy.storage import read_policy_card
 from tint_sumo.scenes import T_INTERSECTION, Scene, find_scene, paper_scene
 from tint_sumo.scenes.drivers import DriverMember, members
 from tint_sumo.scenes.geometry import clearance_m

@@ -21,10 +21,11 @@ from matplotlib.figure import Figure
 from tint_sumo.benchmark import Suite, Trial, evaluate
 from tint_sumo.config import PPO_BUDGETS, SNAPSHOTS_PERCENT, STEP_S, Mix
 from tint_sumo.core.files import whole_file, write_frame
+from tint_sumo.core.weights import card_file
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.evaluation import REPORTED_SET
 from tint_sumo.methods.training import CURVE_FILE, snapshot_stem
-from tint_sumo.policy.storage import card_file, read_policy_card
+from tint_sumo.policy.storage import read_policy_card
 from tint_sumo.study.published import RATES_PERCENT
 
 LOOKS = {"paper": ("#1793fc", "the paper's recipe"), "full": ("#d77e0b", "our recipe")}

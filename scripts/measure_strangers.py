@@ -30,10 +30,11 @@ from tint_sumo.core.statistics import (
     interquartile_interval,
     interquartile_mean,
 )
+from tint_sumo.core.weights import card_file, weights_file
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import METHODS, find_learned
 from tint_sumo.methods.training import POLICY
-from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
+from tint_sumo.policy.storage import read_policy_card
 from tint_sumo.study.budgets import STRANGERS_TESTS
 from tint_sumo.study.tables import Lines, markdown_table
 

@@ -173,7 +173,7 @@ def test_a_policy_whose_outputs_overflow_is_refused(run: Path) -> None:
     """Its weights are finite."""
     weights = safetensors.torch.load_file(run / "policy.safetensors")
     huge = {name: weight * 1e12 for name, weight in weights.items()}
-    change_card(run, **write_weights(run / "policy.safetensors", huge))
+    change_card(run, **write_weights(run / "policy", huge))
     assert refused(run).startswith(f"{run / 'policy.safetensors'}: the policy's outputs are not finite")
 
 

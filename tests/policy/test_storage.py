@@ -17,10 +17,10 @@ from tests.simulation.scenes import T
 from tint_sumo.config import PolicySettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
-from tint_sumo.core.weights import SHA256, write_weights
+from tint_sumo.core.weights import SHA256, card_file, weights_file, write_weights
 from tint_sumo.envs.episodes import action_space, observation_space
 from tint_sumo.policy.network import GruPolicy
-from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
+from tint_sumo.policy.storage import load_policy_network, read_policy_card, save_policy
 from tint_sumo.policy.wrappers import TRAITS, TRUE_TRAITS, trait_space
 
 from .tasks import SMALL
@@ -173,7 +173,7 @@ def test_weights_that_are_not_finite_are_refused(saved: Path) -> None:
     weights = load_file(weights_file(saved))
     name = sorted(weights)[0]
     weights[name].view(-1)[0] = float("nan")
-    card_file(saved).write_text(json.dumps({**read_policy_card(saved), **write_weights(weights_file(saved), weights)}))
+    card_file(saved).write_text(json.dumps({**read_policy_card(saved), **write_weights(saved, weights)}))
     assert f"has numbers that are not finite in {name}" in refused(saved)
 
 

@@ -19,24 +19,31 @@ SHA256 = "weights_sha256"  # a card's entry with the checksum of the weights bes
 _TYPES = {"F32": torch.float32, "F64": torch.float64, "I64": torch.int64, "BOOL": torch.bool}
 
 
-def write_weights(file: Path, weights: Mapping[str, Tensor]) -> dict[str, str]:
-    """Write the weights; return the card's entries about the file."""
+def weights_file(stem: Path) -> Path:
+    """Return the file of the weights of a model, which is given without its suffix."""
+    return stem.with_name(stem.name + ".safetensors")
+
+
+def card_file(stem: Path) -> Path:
+    """Return the file of the card that describes a model, which is given without its suffix."""
+    return stem.with_name(stem.name + ".json")
+
+
+def write_weights(stem: Path, weights: Mapping[str, Tensor]) -> dict[str, str]:
+    """Write the weights of a model; return the card's entries about the file."""
     content = safetensors.torch.save(dict(weights))
-    write_bytes(file, content)
+    write_bytes(weights_file(stem), content)
     return {SHA256: hashlib.sha256(content).hexdigest()}
 
 
-def read_weights(
-    file: Path, card_file: Path, build: Callable[[], nn.Module], card: Mapping[str, Any]
-) -> dict[str, Tensor]:
-    """Return the weights in a file.
+def read_weights(stem: Path, build: Callable[[], nn.Module], card: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return the weights of a model.
 
     The header of the file is read first, and compared with the network that the card describes, before any memory is
     taken for that network.
 
     Args:
-        file: of the weights.
-        card_file: file of the card, for messages.
+        stem: path of the model without its suffix.
         build: makes the network; it is called to look at the sizes of weights alone.
         card: content of the card; weights without a checksum there are read, with a line on stderr.
 
@@ -44,6 +51,7 @@ def read_weights(
         InputError: the file is missing, damaged, not the one that the card describes, or holds a number that is not
             finite; or ``build`` raises it.
     """
+    file, described = weights_file(stem), card_file(stem)
     require_file(file, "weights", WEIGHTS_BYTES)
     with torch.device("meta"):
         wanted = {name: (tensor.dtype, tuple(tensor.shape)) for name, tensor in build().state_dict().items()}
@@ -55,12 +63,12 @@ def read_weights(
     except (OSError, SafetensorError):
         raise InputError(damaged) from None
     if any(wanted.get(name) != form for name, form in found.items()):
-        raise InputError(f"{card_file} does not fit the weights beside it; restore both files")
+        raise InputError(f"{described} does not fit the weights beside it; restore both files")
     content = read_file(file, "weights", WEIGHTS_BYTES)
     if SHA256 not in card:
-        print(f"{card_file} has no checksum of the weights, which are not verified", file=sys.stderr)
+        print(f"{described} has no checksum of the weights, which are not verified", file=sys.stderr)
     elif card[SHA256] != hashlib.sha256(content).hexdigest():
-        raise InputError(f"{file} is damaged: it has another checksum than {card_file.name} says; restore both files")
+        raise InputError(f"{file} is damaged: it has another checksum than {described.name} says; restore both files")
     try:
         weights = safetensors.torch.load(content)
     except SafetensorError:

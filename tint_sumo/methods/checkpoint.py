@@ -107,7 +107,7 @@ def make_checkpoint(model: RecurrentPPO, recent: Iterable[str]) -> bytes:
 
 
 def restore_checkpoint(out: Path, model: RecurrentPPO) -> tuple[str, ...]:
-    """Go on from the checkpoint in the folder of a training, if there is one; the outcomes of the last episodes.
+    """Go on from the checkpoint in the folder of a training, if there is one; return the last outcomes.
 
     Args:
         out: the folder.

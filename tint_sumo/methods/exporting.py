@@ -6,10 +6,11 @@ from pathlib import Path
 from tint_sumo import traits
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import whole_folder, write_json, write_text
+from tint_sumo.core.weights import card_file, weights_file
 from tint_sumo.methods.loading import Contender, find_policy, trait_model_of
 from tint_sumo.methods.model_cards import policy_page, traits_page
 from tint_sumo.methods.training import POLICY, TRAITS
-from tint_sumo.policy.storage import card_file, read_policy_card, weights_file
+from tint_sumo.policy.storage import read_policy_card
 from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.storage import RUN_MODEL, find, read_card
 

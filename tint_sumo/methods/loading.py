@@ -16,13 +16,14 @@ from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
 from tint_sumo.core.structures import build
+from tint_sumo.core.weights import card_file, weights_file
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.perceived import perceived_in
 from tint_sumo.methods.registry import METHODS, Learned, Policy, Rule, find_learned
 from tint_sumo.methods.rules import ACTIONS as RULE_ACTIONS
 from tint_sumo.methods.training import POLICY, TRAITS, digest
 from tint_sumo.policy import GruPolicy, RecurrentPPO, TraitSource
-from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, require_finite, weights_file
+from tint_sumo.policy.storage import load_policy_network, read_policy_card, require_finite
 from tint_sumo.policy.wrappers import OnStep, policy_venv
 from tint_sumo.scenes import ALL_SCENES, SCENES, AnyScene, SumocfgScene, find_scene, paper_scene, read_described
 from tint_sumo.traits import TraitModel

@@ -89,7 +89,7 @@ class Learned:
 
     @property
     def sees_true_traits(self) -> bool:
-        """Whether its training does."""
+        """Whether true traits are used in its training."""
         return self.source is true_traits or self.critic_sees_true_traits or self.trained_as is not None
 
     @property

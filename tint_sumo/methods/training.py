@@ -29,6 +29,7 @@ from tint_sumo.core.progress import Progress, Report, silent
 from tint_sumo.core.provenance import versions
 from tint_sumo.core.structures import plain
 from tint_sumo.core.training_log import log_film, open_log
+from tint_sumo.core.weights import card_file, weights_file
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.rows import outcomes_in
 from tint_sumo.methods.calibration import Calibration, calibrate
@@ -36,7 +37,7 @@ from tint_sumo.methods.checkpoint import make_checkpoint, restore_checkpoint
 from tint_sumo.methods.evaluation import CASE_SEED
 from tint_sumo.methods.registry import Learned, find_learned
 from tint_sumo.policy import GruPolicy, RecurrentPPO
-from tint_sumo.policy.storage import card_file, load_policy_network, read_policy_card, save_policy, weights_file
+from tint_sumo.policy.storage import load_policy_network, read_policy_card, save_policy
 from tint_sumo.policy.wrappers import policy_venv
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, described, find_scenes
 from tint_sumo.scenes.drivers import require_two_kinds

@@ -19,7 +19,7 @@ from tint_sumo.core.errors import InputError, NotFiniteError
 from tint_sumo.core.files import read_json, write_json
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import FieldError, build
-from tint_sumo.core.weights import read_weights, write_weights
+from tint_sumo.core.weights import card_file, read_weights, weights_file, write_weights
 from tint_sumo.envs.episodes import observation_space
 from tint_sumo.envs.perceived import perceived_in
 from tint_sumo.policy.network import GruPolicy
@@ -68,7 +68,7 @@ def save_policy(policy: GruPolicy, stem: Path, card: Mapping[str, Any]) -> None:
     }
     if perceives := perceived_in(space.spaces):
         network["perceives"] = perceives
-    checksum = write_weights(weights_file(stem), _weights_once(policy))
+    checksum = write_weights(stem, _weights_once(policy))
     write_json(card_file(stem), {**card, _NETWORK: network, **checksum})
 
 
@@ -82,7 +82,7 @@ def load_policy_network(stem: Path) -> GruPolicy:
     try:
         network: _Network = build(_Network, card[_NETWORK])
         with preserved_random_state():
-            weights = read_weights(weights_file(stem), card_file(stem), lambda: _build(network), card)
+            weights = read_weights(stem, lambda: _build(network), card)
             policy = _build(network)
     except FieldError as error:
         raise InputError(f"{card_file(stem)}: unusable network ({error}); restore the file") from None
@@ -149,14 +149,6 @@ def read_versions(stem: Path) -> dict[str, str]:
     except FieldError as error:
         raise InputError(f"{card_file(stem)}: {error}; restore the file") from None
     return found
-
-
-def weights_file(stem: Path) -> Path:
-    return stem.with_name(stem.name + ".safetensors")
-
-
-def card_file(stem: Path) -> Path:
-    return stem.with_name(stem.name + ".json")
 
 
 def _build(network: _Network) -> GruPolicy:

@@ -1,4 +1,4 @@
-"""The environments a policy is trained and tested in: a scene, traits in its observations, decisions now and then."""
+"""The environments of policies in training and tests: a scene, traits in observations, a decision for several steps."""
 
 import copy
 from collections.abc import Callable, Iterator, Sequence

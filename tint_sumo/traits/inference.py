@@ -48,8 +48,8 @@ def infer_traits(
         than the gap that stands for none, which is 20 m in scenes), latent_1, ... and std_1, ... (mean and standard
         deviation of the window's posterior). Of ``cross_window``, also fused_latent_1, ... and fused_std_1, ...: what
         the vehicle's windows say together, up to this one. If the model's card knows the range of its training's
-        inputs, also outside: whether the window has a step whose offset or gap no training window had; and which of
-        them is the farthest beyond
+        inputs, also outside (whether the window has a step whose offset or gap no training window had), and
+        outside_input, outside_step, outside_m, trained_low_m and trained_high_m, which say what is the farthest beyond
         (``tint_sumo.traits.input_range.InputRange.farthest_outside``).
 
     Raises:

@@ -16,7 +16,7 @@ _WAIT = 0  # action
 _STEPS = Range(1, 10_000_000)
 _TRACKS_PER_EPISODE = 100_000
 _BOLDNESS = (0.0, 0.03, 0.1, 0.3)  # probabilities of an explorer's move, one of them drawn for each episode
-_MOVE_STEPS = (4, 9)  # for which it keeps an action, drawn from this range
+_MOVE_STEPS = (4, 9)  # drawn from this range, the end excluded; it keeps an action for one step more
 
 Drive = Callable[[NDArray[np.bool_]], NDArray[np.int64]]
 """Takes which of N episodes have just begun, and returns N actions."""

@@ -94,9 +94,7 @@ class _Tracks:
     mean: Floats  # (M, 2) of time gap and gap over all steady steps, or (M,) of their weighted sum
     count: Floats  # (M,) number of these steps
     first_mean: Floats  # like ``mean``, until one second before the track's middle
-    first_count: Floats
     last_mean: Floats  # from one second after it on
-    last_count: Floats
 
     @classmethod
     def of(cls, seen: Perceived, settings: RelativeSettings) -> Self:
@@ -119,7 +117,8 @@ class _Tracks:
                 "relative traits need two episodes with two drivers each who follow their leader steadily twice; "
                 "give more traffic"
             )
-        return cls(episode, *(half for part in parts for half in (part[:, :-1] / part[:, -1:], part[:, -1])))
+        mean, first_mean, last_mean = (part[:, :-1] / part[:, -1:] for part in parts)
+        return cls(episode, mean, parts[0][:, -1], first_mean, last_mean)
 
     def combined(self, weights: Floats) -> Self:
         """Return the tracks with a weighted sum of the statistics in place of them."""
@@ -182,7 +181,8 @@ def _latent(tracks: _Tracks, weights: Floats) -> RelativeLatent:
 def _with_differences(tracks: _Tracks, latent: RelativeLatent) -> tuple[RelativeLatent, float]:
     """Return a latent with the likeliest probabilities of differences (expectation maximisation), and the likelihood.
 
-    It is the logarithm of the density of all tracks' weighted sums, in nats per track.
+    It is the logarithm of the density of all tracks' weighted sums, in nats per track, before the last of the rounds,
+    which changes it little.
     """
     for _ in range(_ROUNDS):
         beliefs, density = _towns(tracks, latent)

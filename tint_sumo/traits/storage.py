@@ -11,7 +11,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_json, shipped, write_json
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import FieldError, build
-from tint_sumo.core.weights import read_weights, write_weights
+from tint_sumo.core.weights import card_file, read_weights, weights_file, write_weights
 from tint_sumo.traits.input_range import InputRange
 from tint_sumo.traits.model import TRAIT_METHODS, TraitModel
 
@@ -41,14 +41,14 @@ def save(model: TraitModel, stem: Path, card: Mapping[str, Any]) -> None:
     The card holds method, settings and latent size of the model, the checksum of its weights, and whatever else
     ``card`` says about it (data, seed, accuracy). It is written last, so that where there is a card there are weights.
     """
-    checksum = write_weights(_weights_file(stem), model.state_dict())
+    checksum = write_weights(stem, model.state_dict())
     described = {
         "method": model.method,
         "latent_size": model.latent_size,
         "settings": asdict(model.settings),
         "no_leader_gap_m": model.no_leader_gap_m,
     }
-    write_json(_card_file(stem), {**card, **described, **checksum})
+    write_json(card_file(stem), {**card, **described, **checksum})
 
 
 def load(name_or_path: str | Path, latent_size: int | None = None) -> TraitModel:
@@ -69,13 +69,13 @@ def load(name_or_path: str | Path, latent_size: int | None = None) -> TraitModel
             f"trait model {name_or_path} has {card.latent_size} latents where {latent_size} are needed; "
             "use a model trained with that latent size"
         )
-    weights = read_weights(_weights_file(stem), _card_file(stem), lambda: _build(card, stem), card.entries)
+    weights = read_weights(stem, lambda: _build(card, stem), card.entries)
     model = _build(card, stem)
     try:
         model.load_state_dict(weights)
     except RuntimeError:
         raise InputError(
-            f"{_card_file(stem)} does not fit the weights beside it; restore both files of the model"
+            f"{card_file(stem)} does not fit the weights beside it; restore both files of the model"
         ) from None
     return model.eval().requires_grad_(False)
 
@@ -116,7 +116,7 @@ def require_scene_gaps(name_or_path: str | Path) -> None:
 def add_to_card(name_or_path: str | Path, entries: Mapping[str, Any]) -> None:
     """Add entries, such as an accuracy, to the card of a saved model."""
     stem = find(name_or_path)
-    write_json(_card_file(stem), {**_read_card(stem).entries, **entries})
+    write_json(card_file(stem), {**_read_card(stem).entries, **entries})
 
 
 def find(name_or_path: str | Path) -> Path:
@@ -128,7 +128,7 @@ def find(name_or_path: str | Path) -> Path:
     given = Path(name_or_path)
     weights = given.with_suffix("") if given.suffix == ".safetensors" else given
     for stem in (shipped("models") / given, given / RUN_MODEL, weights):
-        if stem.name and _weights_file(stem).is_file():
+        if stem.name and weights_file(stem).is_file():
             return stem
     known = sorted(file.stem for file in shipped("models").glob("*.safetensors") if _is_trait_model(file))
     raise InputError(
@@ -146,7 +146,7 @@ def _is_trait_model(weights: Path) -> bool:
 
 
 def _read_card(stem: Path) -> ModelCard:
-    file = _card_file(stem)
+    file = card_file(stem)
     entries = read_json(file, "card of the trait model")
     mend = "restore the file or train the model again"
     if str(entries.get("method")) not in TRAIT_METHODS:
@@ -166,15 +166,7 @@ def _build(card: ModelCard, stem: Path) -> TraitModel:
             model = TRAIT_METHODS[card.method](card.settings, card.latent_size)
     except (TypeError, ValueError, RuntimeError, IndexError) as error:
         raise InputError(
-            f"{_card_file(stem)}: unusable settings ({error}); restore the file or train the model again"
+            f"{card_file(stem)}: unusable settings ({error}); restore the file or train the model again"
         ) from None
     model.no_leader_gap_m = card.no_leader_gap_m
     return model
-
-
-def _weights_file(stem: Path) -> Path:
-    return stem.with_name(stem.name + ".safetensors")
-
-
-def _card_file(stem: Path) -> Path:
-    return stem.with_name(stem.name + ".json")

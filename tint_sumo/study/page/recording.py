@@ -18,6 +18,7 @@ from tint_sumo.core.progress import Progress, Report, part_of
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.reading import RESULT_BYTES
 from tint_sumo.core.structures import FieldError, build, plain
+from tint_sumo.core.weights import weights_file
 from tint_sumo.envs.rows import Outcome
 from tint_sumo.films.driving import Driven, Moment, drive_case
 from tint_sumo.films.trait_probe import TraitReader, fit_reader
@@ -26,7 +27,7 @@ from tint_sumo.jobs.jobs import THREADS_PER_JOB
 from tint_sumo.methods.evaluation import CASES_PER_SET, REPORTED_SET
 from tint_sumo.methods.loading import Contender, find_policy, load_policy
 from tint_sumo.methods.registry import METHODS, Rule
-from tint_sumo.policy.storage import read_policy_card, weights_file
+from tint_sumo.policy.storage import read_policy_card
 from tint_sumo.scenes import Scene, described, paper_scene
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.jobs import label, policy_folder, policy_path

@@ -518,6 +518,24 @@ def test_what_traits_gain_among_strangers_is_that_of_the_results() -> None:
     assert "(five seeds each)" in _prose("README.md") and len(without) == len(by_seed["relative"]) == 5
 
 
+def test_the_old_policy_without_traits_is_compared_with_the_new_ones_as_in_the_results() -> None:
+    measured = _strangers()
+    rates = [f"{outcome}_percent" for outcome in ("success", "collision")]
+    by_world = measured.groupby(["trained_in", "method", "world"])[rates].mean()
+    old, new = by_world.loc["old", "no_labels"], by_world.loc["strangers", "relative"]
+    ahead = int((old["success_percent"] > new["success_percent"]).sum())
+    (success, collision), (new_success, new_collision) = old.mean().round().astype(int), new.mean().round().astype(int)
+    readme, results, page = map(_prose, ("README.md", "docs/results/index.md", "docs/explanation/strangers.md"))
+    assert f"({success} against {new_success} %), but collides twice as often ({collision} against" in readme
+    assert f"{new_collision} %)" in readme and 1.5 < old["collision_percent"].mean() / new_collision < 2.5
+    assert f"in {ahead} of the 18 worlds and in {success} % in the mean of all" in results
+    assert f"in {collision} % of the cases against {new_collision}." in results
+    assert f"has {success} % in the mean of all worlds and is ahead in {ahead} of the 18" in page
+    assert f"`relative` has {new_success} %" in page and f"{collision} % collisions against {new_collision} %" in page
+    lead = (old["success_percent"] - new["success_percent"]).sort_values()
+    assert set(lead.index[-3:]) == {"same_speed", "acc", "krauss"}
+
+
 def test_the_profile_of_trainings_is_that_of_the_results() -> None:
     (table,) = (one for one in _tables(DOCS / "explanation" / "training.md") if "SUMO's step" in one)
     _, _, *lines = table.strip().split("\n")

@@ -87,11 +87,11 @@ def test_trait_budgets_are_networks_of_one_kind() -> None:
         (Conditions(Mix(0.4)), "as trained"),
         (Conditions(ALL_MIXES), "as trained"),
         (Conditions(Mix(0.4), position_noise_m=0.05), "noise 0.05 m"),
-        (Conditions(Mix(0.4), tau_s=1.5), "tau 1.5 s"),
-        (Conditions(Mix(0.4), tau_s=Idm.tau_s), "tau 1 s"),
+        (Conditions(Mix(0.4), tau_s=1.5), "headway 1.5 s"),
+        (Conditions(Mix(0.4), tau_s=Idm.tau_s), "headway 1 s"),
         (Conditions(Mix(0.4), percent=25), "25 % of training"),
         (Conditions(ALL_MIXES, percent=50, world="range_15"), "range 15 m, 50 % of training"),
-        (Conditions(Mix(0.4), 0.1, 0.7, 50), "noise 0.1 m, tau 0.7 s, 50 % of training"),
+        (Conditions(Mix(0.4), 0.1, 0.7, 50), "noise 0.1 m, headway 0.7 s, 50 % of training"),
     ],
 )
 def test_conditions_are_called_by_what_differs_from_the_training(conditions: Conditions, label: str) -> None:

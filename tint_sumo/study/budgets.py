@@ -78,7 +78,7 @@ class Conditions:
         parts = [
             "" if self.world is None else find_world(self.world).title,
             f"noise {self.position_noise_m:g} m" if self.position_noise_m else "",
-            f"tau {self.tau_s:g} s" if self.tau_s is not None else "",
+            f"headway {self.tau_s:g} s" if self.tau_s is not None else "",
             f"{self.percent} % of training" if self.percent != 100 else "",
         ]
         return ", ".join(part for part in parts if part) or "as trained"

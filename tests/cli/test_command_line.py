@@ -1,10 +1,12 @@
 """The command line as a whole: help, versions, bad input, folders that are left alone, interruptions."""
 
+import ast
 import json
 import platform
 import subprocess
 import sys
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,7 @@ import torch
 
 from tests.cli.calls import copy, files, refuse
 from tests.commands import commands
-from tint_sumo import __version__
+from tint_sumo import __version__, cli
 from tint_sumo.cli import main
 
 COMMANDS = tuple(name for name, _ in commands())
@@ -24,6 +26,16 @@ def test_every_command_has_help_and_json(command: str, capsys: pytest.CaptureFix
         main([*command.split(), "--help"])
     assert stop.value.code == 0
     assert "--json" in capsys.readouterr().out
+
+
+def test_help_texts_of_flags_are_single_lines() -> None:
+    """Tyro would keep the line breaks of the source, in the middle of a sentence."""
+    for module in Path(cli.__file__).parent.glob("*.py"):
+        for kind in ast.walk(ast.parse(module.read_text())):
+            if isinstance(kind, ast.ClassDef):
+                for field, text in pairwise(kind.body):
+                    if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                        assert "\n" not in ast.literal_eval(text.value), f"{module.name}: {kind.name}"
 
 
 @pytest.mark.parametrize("columns", [60, 80])
@@ -116,6 +128,7 @@ def test_argument_errors_exit_with_2(argv: list[str], capsys: pytest.CaptureFixt
         ("policy evaluate --model ttc --p-conservative 2", "p_conservative"),
         ("policy evaluate --model ttc --scene moon", "unknown scene 'moon'"),
         ("policy evaluate --model ttc --noise -1", "noise must lie in 0 to 1000, not -1.0"),
+        ("policy evaluate --model ttc --world headway_2.0 --tau 1.5", "a world has the headways of its drivers"),
         ("policy evaluate --model ttc --tau 0", "tau must lie in 0.01 to 20, not 0.0"),
         ("policy evaluate --model ttc --episodes 0", "episodes"),
         ("policy evaluate --model ttc --seed -1", "seed"),

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, arg, subcommand
 
 from tint_sumo.cli.bench import Bench
 from tint_sumo.cli.command import Command, flag_of
@@ -34,6 +34,10 @@ from tint_sumo.core.redaction import redact
 from tint_sumo.core.streams import READER_GONE, flushed_output, has_lost_reader, show_any_name
 
 Shell = Literal["bash", "zsh", "tcsh"]
+_COMPLETION = arg(
+    help="Print a script that completes commands and flags in that shell, and do nothing else. For bash, put this line "
+    'into ~/.bashrc: eval "$(tint-sumo --print-completion bash)".'
+)
 _TYRO = (OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff)
 
 
@@ -43,9 +47,7 @@ class TintSumo:
 
     version: bool = False
     """Print the version, and those of SUMO, torch, gymnasium and Python, and do nothing else."""
-    print_completion: Shell | None = None
-    """Print a script that completes commands and flags in that shell, and do nothing else. For bash, put this line into
-    ~/.bashrc: eval "$(tint-sumo --print-completion bash)"."""
+    print_completion: Annotated[Shell | None, _COMPLETION] = None
 
     command: (
         Annotated[Net, subcommand("net")]

@@ -75,6 +75,6 @@ class ImportNet(Command):
 # tyro makes subcommands of unions only, hence the None.
 @dataclass(frozen=True)
 class Net:
-    """Road networks for SUMO: of the built-in scenes, or imported from maps. Without a word behind it: build."""
+    """Road networks for SUMO: of the built-in scenes, or imported from maps. Alone it is net build."""
 
     command: Annotated[BuildNet, subcommand("build")] | Annotated[ImportNet, subcommand("import")] | Suppress[None]

@@ -42,6 +42,10 @@ if TYPE_CHECKING:
 
 _LEARNED = ", ".join(learned_methods())
 
+_BUDGET = arg(
+    help="Size of the network, settings of PPO and number of decisions; full takes 5 to 10 minutes on a free core. In "
+    "a SUMO configuration full has 8 environments, each a process, and 200,000 decisions."
+)
 _TRAITS = optional(
     "MODEL",
     "Trait model of a method that infers traits: name of a shipped one, folder of a training, or path of a "
@@ -76,9 +80,7 @@ class TrainPolicy(NetworkCommand):
     steps: Annotated[Decisions | None, optional("INT", "Decisions of the policy.", "the budget's")] = None
     seed: Seed = 0
     """Seed of the training, 0 to 1000."""
-    budget: PpoBudgetValue = "full"
-    """Size of the network, settings of PPO and number of decisions; full takes 5 to 8 minutes on a free core. In a SUMO
-    configuration full has 8 environments, each a process, and 200,000 decisions."""
+    budget: Annotated[PpoBudgetValue, _BUDGET] = "full"
     world: WorldName = None
     sensor: Annotated[SensorValue, _SENSOR] = "perfect"
     scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}, or all but t_intersection_street at once: all.")] = (
@@ -157,8 +159,20 @@ class PolicyCommand(NetworkCommand):
         contender = load_policy(self.model, scene=self.scene_of(self.scene), allow_pickle=self.allow_pickle)
         return contender, self._task(contender)
 
+    def content_of(self, task: "TaskSettings") -> dict[str, Any]:
+        """Return what --json prints of the policy and of settings of its environments."""
+        return {
+            "model": self.model,
+            "scene": task.scene.name,
+            "world": self.world,
+            "p_conservative": plain(task.p_conservative),
+            "sensor": next((name for name, known in SENSORS.items() if known == task.sensor), plain(task.sensor)),
+            "position_noise_m": task.sensor.noise_m,
+            "tau_s": task.played.tau_s,
+        }
+
     def _task(self, contender: "Contender") -> "TaskSettings":
-        """Raise InputError if there are two noises, or two sensors."""
+        """Raise InputError if there are two noises, two sensors or two headways."""
         from tint_sumo.envs.episodes import find_sensor
         from tint_sumo.envs.worlds import find_world, task_in
 
@@ -166,6 +180,8 @@ class PolicyCommand(NetworkCommand):
         task = replace(contender.task, p_conservative=mix, tau_s=self.tau)
         if self.world is not None:
             require_one_sensor(self.sensor)
+            if self.tau is not None:
+                raise InputError("a world has the headways of its drivers; give `world` or `tau`")
             task = task_in(find_world(self.world), task)
         if self.sensor is not None:
             task = replace(task, sensor=find_sensor(self.sensor))
@@ -216,7 +232,7 @@ class EvaluatePolicy(PolicyCommand, SpreadCommand):
         lines.append("no success" if time_s is None else f"navigation time {time_s:.1f} s")
         if evaluation.cost is not None:
             lines.append(f"driven over at red {evaluation.cost:.2f} stop lines per case")
-        content = {"model": self.model, **content_of(task), "seed": self.seed, **evaluation.summary()}
+        content = {**self.content_of(task), "seed": self.seed, **evaluation.summary()}
         return Outcome("\n".join(lines), content)
 
 
@@ -260,7 +276,7 @@ class RecordPolicy(PolicyCommand):
             )
         lines = [f"{outcome:9} {count}" for outcome, count in found.outcomes.items()]
         text = "\n".join([*lines, f"{found.steps} decisions", *wrote([str(found.folder)])])
-        content = {"model": self.model, **content_of(task), "seed": self.seed, "random_actions": self.random_actions}
+        content = {**self.content_of(task), "seed": self.seed, "random_actions": self.random_actions}
         shown = {"episodes": self.episodes, "decisions": found.steps, "outcomes": found.outcomes}
         return Outcome(text, {**content, **shown, "minari": self.minari, "folder": str(found.folder)})
 
@@ -346,14 +362,3 @@ def require_one_sensor(sensor: "str | Sensor | None") -> None:
     """Raise InputError if a sensor is given beside a world, which has one."""
     if sensor is not None:
         raise InputError("a world has a sensor; give `world` or `sensor`")
-
-
-def content_of(task: "TaskSettings") -> dict[str, Any]:
-    """Return what --json prints of settings of environments."""
-    return {
-        "scene": task.scene.name,
-        "p_conservative": plain(task.p_conservative),
-        "sensor": next((name for name, known in SENSORS.items() if known == task.sensor), plain(task.sensor)),
-        "position_noise_m": task.sensor.noise_m,
-        "tau_s": task.played.tau_s,
-    }

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from tyro.conf import Positional, subcommand
+from tyro.conf import Positional, arg, subcommand
 
 from tint_sumo.cli.command import RESUMES, Command, Outcome, SpreadCommand, names_in, wrote
 from tint_sumo.cli.values import BUDGET, SCENE_STUDY, BudgetValue, FolderOrUrl, Gpus, Scene, SceneStudyValue, optional
@@ -15,6 +15,10 @@ from tint_sumo.core.stores import working_folder
 if TYPE_CHECKING:
     from tint_sumo.study.report import StudyReport
 
+_BUDGET = arg(
+    help="quick: few decisions, minutes. full: all methods, four seeds, three hours. strangers: trained in 128 towns "
+    "with nine sensors, tested in held-out worlds, two days. paper: the paper's numbers, days."
+)
 _OUT = optional("FOLDER|URL", "Folder of the study, or a URL such as s3://bucket/folder.", "runs/BUDGET")
 
 
@@ -24,9 +28,7 @@ class RunStudy(SpreadCommand):
 
     after_interrupt: ClassVar[str] = RESUMES
 
-    budget: BudgetValue = "quick"
-    """quick: few decisions, minutes. full: all methods, four seeds, three hours. strangers: trained in 128 towns with
-    nine sensors, tested in held-out worlds, two days. paper: the paper's numbers, days."""
+    budget: Annotated[BudgetValue, _BUDGET] = "quick"
     out: Annotated[str | None, _OUT] = None
     scene: Scene = "t_intersection"
     workers: Processes = 2

@@ -57,7 +57,7 @@ class GymnasiumVectorEnv(SceneVectorEnv):
 
 
 class StrangersEnv(SceneEnv):
-    """A scene in a world: drivers of one of many towns, seen through a sensor; the benchmark of driving among strangers.
+    """A scene in a world: drivers of one of many towns, and a sensor; the benchmark of driving among strangers.
 
     ## Description
     ``SceneEnv`` in one of ``tint_sumo.config.WORLDS``, by default among the drivers of 128 towns. Each episode is in

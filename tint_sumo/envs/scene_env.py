@@ -46,27 +46,22 @@ class SceneEnv(gymnasium.Env[Any, Any]):
 
     In a SUMO configuration, `perceives` of the scene adds keys of the ego's road:
 
-    | Key             | Shape  | Content                                                                           |
-    |-----------------|--------|-----------------------------------------------------------------------------------|
-    | `traffic_light` | `(8,)` | the next traffic light on the ego's route: six numbers of which one is 1 (red or  |
-    |                 |        | red with yellow, yellow, green with priority, green without priority, stop and    |
-    |                 |        | then go, switched off); the distance from the ego's front to its stop line / 20 m,|
-    |                 |        | up to 5 (100 m); time in this state / 10 s, up to 10 (100 s). Without one to come |
-    |                 |        | the distance is 5, and all else 0                                                 |
-    | `right_of_way`  | `(2,)` | at the next junction, or the one that the ego is on: 1 if the ego's link has no   |
-    |                 |        | priority there (signs, red, the right before the left), and the distance from its |
-    |                 |        | front to the junction / 20 m, up to 5. Without one to come, 0 and 5               |
-    | `priority`      | `(V,)` | comes with `right_of_way`: 1 where the vehicle in the slot has priority over the  |
-    |                 |        | ego there by SUMO's rules: it is on its way to the junction, or on it, its way    |
-    |                 |        | meets the ego's, and its light, if any, is not red                                |
-    | `speed_limit`   | `(1,)` | speed limit of the ego's lane, divided by the scale of its velocity, up to 2      |
-    | `lane`          | `(2,)` | number of the ego's lane, 0 at the outer side of its edge (to the right in        |
-    |                 |        | right-hand traffic), and how many lanes the edge has; on junctions of their lanes |
-
-    | `pedestrians`   | `(8, 4)` | the nearest persons on foot in sight, nearest first: x, y of their centres      |
-    |                 |          | minus the ego's, scaled as in `vehicles`, and their x, y velocity, scaled as    |
-    |                 |          | the ego's, all up to 2; 0 in empty places                                       |
-    | `pedestrian_mask` | `(8,)` | comes with `pedestrians`: 1 where there is one                                  |
+    * `traffic_light`, `(8,)`: the next traffic light on the ego's route: six numbers of which one is 1 (red or red
+      with yellow, yellow, green with priority, green without priority, stop and then go, switched off); the
+      distance from the ego's front to its stop line / 20 m, up to 5 (100 m); time in this state / 10 s, up to 10
+      (100 s). Without one to come the distance is 5, and all else 0
+    * `right_of_way`, `(2,)`: at the next junction, or the one that the ego is on: 1 if the ego's link has no
+      priority there (signs, red, the right before the left), and the distance from its front to the junction / 20
+      m, up to 5. Without one to come, 0 and 5
+    * `priority`, `(V,)`: comes with `right_of_way`: 1 where the vehicle in the slot has priority over the ego there
+      by SUMO's rules: it is on its way to the junction, or on it, its way meets the ego's, and its light, if any,
+      is not red
+    * `speed_limit`, `(1,)`: speed limit of the ego's lane, divided by the scale of its velocity, up to 2
+    * `lane`, `(2,)`: number of the ego's lane, 0 at the outer side of its edge (to the right in right-hand
+      traffic), and how many lanes the edge has; on junctions of their lanes
+    * `pedestrians`, `(8, 4)`: the nearest persons on foot in sight, nearest first: x, y of their centres minus the
+      ego's, scaled as in `vehicles`, and their x, y velocity, scaled as the ego's, all up to 2; 0 in empty places
+    * `pedestrian_mask`, `(8,)`: comes with `pedestrians`: 1 where there is one
 
     The sensor is for other road users: `priority` goes with the vehicles' slots, and persons are seen as vehicles are,
     with noise on their positions. The ego knows all else as it is.
@@ -84,6 +79,8 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     | `speed`     | 0.05 x ego speed (m/s) otherwise  | 0.05 / 3 x ego speed otherwise    |
     | `step`      | -0.0013 otherwise                 | -0.013 otherwise                  |
 
+    `reward="careful"` has the paper's values, but -10 on collision.
+
     In a SUMO configuration with steps of T s and L m from the ego's start to its goal, `step` is multiplied by T / 0.1,
     and `speed` by T / 0.1 x 17.2 / L: all of the way is worth as much as in the T-intersection, whose way has 17.2 m.
     If red lights have consequences there (see Arguments), `red_light` is a term, too.
@@ -100,29 +97,26 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     waited for longer than `time-to-teleport`, and calibrators remove them.
 
     ## Information
-    | Key            | Content                                                                                     |
-    |----------------|---------------------------------------------------------------------------------------------|
-    | `traits`       | `(V,)` int16, true traits: number of the driver's profile, 0 conservative and 1 aggressive;  |
-    |                | -1 in empty slots. In a population with `willingness`: would it yield now? 0 yes, 1 no      |
-    | `position_m`   | with `tracks`: `(V,)` where each vehicle's front is seen on its route; 0 in empty slots     |
-    | `gap_m`        | with `tracks`: `(V,)` the gap that is seen to the next vehicle ahead; infinite without one  |
-    | `passed`       | with `tracks`: `(V,)` int8, 1 where the ego has left the vehicle's route behind             |
-    | `claimed`      | with `tracks`: `(V,)` int8, 1 where the ego claims the vehicle's route                      |
-    | `to_stop_m`    | with `tracks`: `(V,)` from each vehicle's front to where it would stop for the ego;         |
-    |                | negative past it, infinite where it never meets the ego                                     |
-    | `track`,       | with a sensor: `(V,)` number of the track in the episode that the slot shows, and of the    |
-    | `slot`         | simulation's slot with its vehicle; -1 in empty slots                                       |
-    | `true_mask`,   | with a sensor: `(V,)` and `(V, 2)`, the simulation's slots as they are, seen or not, with   |
-    | `true_vehicles`| their traits in `true_traits`: not to be used by policies                                   |
-    | `outcome`      | `"success"`, `"collision"`, `"timeout"`, `"lost"`, `"red_light"`, or `""` while the episode  |
-    |                | goes on                                                                                     |
-    | `reward_terms` | the reward's named terms (after a step)                                                     |
-    | `time_s`       | time since the episode's start                                                              |
-    | `town`         | in a population with towns: number of the episode's town                                    |
-    | `is_success`   | at the episode's end: whether the outcome is `"success"`                                    |
-    | `cost`         | after a step, with `red_light="cost"`: number of stop lines driven over at red in it        |
-    | `collision`    | after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`; for a person   |
-    |                | on foot in a SUMO configuration, `trait` is `"pedestrian"` and `slot` is -1                 |
+    * `traits`: `(V,)` int16, true traits: number of the driver's profile, 0 conservative and 1 aggressive; -1 in
+      empty slots. In a population with `willingness`: would it yield now? 0 yes, 1 no
+    * `position_m`: with `tracks`: `(V,)` where each vehicle's front is seen on its route; 0 in empty slots
+    * `gap_m`: with `tracks`: `(V,)` the gap that is seen to the next vehicle ahead; infinite without one
+    * `passed`: with `tracks`: `(V,)` int8, 1 where the ego has left the vehicle's route behind
+    * `claimed`: with `tracks`: `(V,)` int8, 1 where the ego claims the vehicle's route
+    * `to_stop_m`: with `tracks`: `(V,)` from each vehicle's front to where it would stop for the ego; negative past
+      it, infinite where it never meets the ego
+    * `track`, `slot`: with a sensor: `(V,)` number of the track in the episode that the slot shows, and of the
+      simulation's slot with its vehicle; -1 in empty slots
+    * `true_mask`, `true_vehicles`: with a sensor: `(V,)` and `(V, 2)`, the simulation's slots as they are, seen or
+      not, with their traits in `true_traits`: not to be used by policies
+    * `outcome`: `"success"`, `"collision"`, `"timeout"`, `"lost"`, `"red_light"`, or `""` while the episode goes on
+    * `reward_terms`: the reward's named terms (after a step)
+    * `time_s`: time since the episode's start
+    * `town`: in a population with towns: number of the episode's town
+    * `is_success`: at the episode's end: whether the outcome is `"success"`
+    * `cost`: after a step, with `red_light="cost"`: number of stop lines driven over at red in it
+    * `collision`: after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`; for a person on foot
+      in a SUMO configuration, `trait` is `"pedestrian"` and `slot` is -1
 
     ## Arguments
     `gymnasium.make` takes all of these as keyword arguments. The class itself takes `render_mode`, and all others as a
@@ -140,7 +134,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
       environments.
     * `p_conservative`: probability that a driver is conservative, in [0, 1]; default 0.4. Two numbers are a range, from
       which each episode draws its probability uniformly, by its seed.
-    * `reward`: `"paper"` (default) or `"authors"` (the values of the authors' code).
+    * `reward`: `"paper"` (default), `"authors"` (the values of the authors' code) or `"careful"`.
     * `time_limit_s`: default 50 s.
     * `max_episode_steps`: gymnasium's way to say it, in steps of the environment. `gymnasium.make` does not pass it on:
       it wraps the environment in a `TimeLimit`, with which `outcome` stays empty; `gymnasium.make_vec` passes it on.

@@ -96,7 +96,7 @@ def test_a_link_into_a_run_is_seen_through(run: Path, tmp_path: Path, capsys: py
     before = contents(run)
     for out in (tmp_path / "link.png", tmp_path / "folder" / "new.png"):
         assert call(WRITING["dataset inspect"], out, run) == 2
-        assert "which belongs to a run; choose another --figure" in capsys.readouterr().err
+        assert "the folder of a run; choose another --figure" in capsys.readouterr().err
     assert contents(run) == before
     assert (tmp_path / "link.png").is_symlink()
 

@@ -108,16 +108,16 @@ def _others(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["train", "--out", "OUT"], "give either data or tracks"),
-        (["train", "--data", "T", "--tracks", "T", "--out", "OUT"], "give either data or tracks"),
-        (["train", "--data", "T", "--fit", "T", "--out", "OUT"], "fit and format belong to tracks"),
-        (["train", "--tracks", "T", "--streaming", "--out", "OUT"], "streaming is for datasets"),
-        (["infer", "--model", "vae", "--out", "OUT.csv"], "give either fcd or tracks"),
+        (["train", "--out", "OUT"], "give either --data or --tracks"),
+        (["train", "--data", "T", "--tracks", "T", "--out", "OUT"], "give either --data or --tracks"),
+        (["train", "--data", "T", "--fit", "T", "--out", "OUT"], "--fit and --format belong to tracks"),
+        (["train", "--tracks", "T", "--streaming", "--out", "OUT"], "--streaming is for datasets"),
+        (["infer", "--model", "vae", "--out", "OUT.csv"], "give either --fcd or --tracks"),
         (
             ["infer", "--fcd", "T", "--format", "ngsim", "--model", "vae", "--out", "OUT.csv"],
-            "format is that of tracks",
+            "--format is that of tracks",
         ),
-        (["infer", "--tracks", "T", "--net", "T", "--model", "vae", "--out", "OUT.csv"], "net and vtypes belong to"),
+        (["infer", "--tracks", "T", "--net", "T", "--model", "vae", "--out", "OUT.csv"], "--net and --vtypes belong"),
         (["infer", "--tracks", "T", "--model", "vae", "--out", "OUT.csv"], "lie outside what vae was trained on"),
         (["identify", "--tracks", "T", "--model", "vae"], "vae predicts nothing; give a model of method cross_window"),
         (["identify", "--tracks", "T", "--model", "cross_window"], "lie outside what cross_window was trained on"),

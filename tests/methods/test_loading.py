@@ -145,7 +145,10 @@ def test_shipped_policies_by_name(shelf: Path) -> None:
 
 
 def test_unknown_names_are_answered_with_the_known_ones(shelf: Path, tmp_path: Path) -> None:
-    advice = "give always_go, ttc, sumo, no_labels, vae, the folder of a training run or a .safetensors file"
+    (shelf / "strangers").mkdir()
+    (shelf / "strangers" / "mine.safetensors").touch()
+    names = "always_go, ttc, sumo, no_labels, vae, strangers/mine"
+    advice = f"give {names}, the folder of a training run or a .safetensors file"
     assert refused("nobody") == f"no policy nobody; {advice}"
     assert refused(tmp_path).endswith(advice)
     assert refused("oracle").endswith(advice), "a method that nobody has shipped"

@@ -568,7 +568,7 @@ def test_bad_values_leave_no_folder(
 @pytest.mark.parametrize(
     ("method", "given", "message"),
     [
-        ("oracle", {"traits": "vae"}, "method oracle infers no traits; leave the trait model"),
+        ("oracle", {"traits": "vae"}, "method oracle infers no traits; leave `traits` and `other_scene` out"),
         ("no_labels", {"other_scene": True}, "method no_labels infers no traits"),
         (
             "vae",

@@ -112,7 +112,7 @@ class TrainTraits(Command):
         with one_job(f"traits {self.method}") as report:
             if self.tracks is not None:
                 if self.streaming:
-                    raise InputError("streaming is for datasets; leave it out with tracks")
+                    raise InputError("`streaming` is for datasets; leave it out with `tracks`")
                 card = train_on_tracks(
                     self.tracks,
                     self.out,
@@ -126,7 +126,7 @@ class TrainTraits(Command):
             else:
                 assert self.data is not None
                 if self.fit is not None or self.format is not None:
-                    raise InputError("fit and format belong to tracks; give them with tracks in place of data")
+                    raise InputError("`fit` and `format` belong to tracks; give them with `tracks` in place of `data`")
                 card = train_traits(
                     self.data,
                     self.out,
@@ -265,11 +265,11 @@ class InferTraits(Command):
         use_one_thread()
         if self.tracks is not None:
             if self.net is not None or self.vtypes is not None:
-                raise InputError("net and vtypes belong to floating-car data; leave them out with tracks")
+                raise InputError("`net` and `vtypes` belong to floating-car data; leave them out with `tracks`")
             table = infer_recorded(source, self.model, self.format)
         else:
             if self.format is not None:
-                raise InputError("format is that of tracks; give it with tracks in place of fcd")
+                raise InputError("`format` is that of tracks; give it with `tracks` in place of `fcd`")
             table = infer_traits(
                 source, self.model, net_file=self.net, vehicle_length_m=self.vehicle_length, vtypes_file=self.vtypes
             )
@@ -390,7 +390,7 @@ def require_one(**given: Path | None) -> Path:
     """
     paths = [path for path in given.values() if path is not None]
     if len(paths) != 1:
-        raise InputError(f"give either {' or '.join(given)}")
+        raise InputError(f"give either {' or '.join(f'`{name}`' for name in given)}")
     return paths[0]
 
 

@@ -182,7 +182,8 @@ def _require_no_run(path: Path, argument: str) -> None:
     resolved = path.resolve()
     for folder in (resolved, *resolved.parents):
         if (folder / RUN_FILE).exists():
-            raise InputError(f"{path} lies in {folder}, which belongs to a run; choose another `{argument}`")
+            where = "is" if folder == resolved else f"lies in {folder}, which is"
+            raise InputError(f"{path} {where} the folder of a run; choose another `{argument}`")
 
 
 def _require_writable(folder: Path, argument: str) -> None:

@@ -118,7 +118,10 @@ def _in_scene(contender: Contender, scene: AnyScene) -> Contender:
         ("perceives", ", ".join(needed) or "nothing", ", ".join(perceives) or "nothing"),
     ):
         if wanted != there:
-            raise InputError(f"policy {contender.name} needs {what} of {wanted}, and scene {scene.name} has {there}")
+            raise InputError(
+                f"policy {contender.name} needs {what} of {wanted}, and scene {scene.name} has {there}; "
+                "train a policy in that scene"
+            )
     trained_for = Traffic.p_conservative if contender.p_conservative is None else contender.p_conservative
     return replace(contender, scene=scene, p_conservative=None if scene.sumocfg else trained_for)
 
@@ -191,14 +194,16 @@ def find_policy(name_or_path: str | Path) -> Path:
     if (given / "run.json").exists():
         raise InputError(f"{given} holds a run that is not finished; repeat its command to finish it")
     rules = [name for name, method in METHODS.items() if isinstance(method, Rule)]
+    folder = shipped("models") / "policies"
+    others = sorted(file.relative_to(folder).with_suffix("").as_posix() for file in folder.glob("*/*.safetensors"))
     raise InputError(
-        f"no policy {name_or_path}; give {', '.join([*rules, *shipped_policies()])}, the folder of a training run "
-        "or a .safetensors file"
+        f"no policy {name_or_path}; give {', '.join([*rules, *shipped_policies(), *others])}, the folder of a training "
+        "run or a .safetensors file"
     )
 
 
 def shipped_policies() -> list[str]:
-    """Return the names of the policies that come with the package, in the order of the methods."""
+    """Return the names of the shipped policies of the paper's setting, in the order of the methods."""
     return [name for name in METHODS if weights_file(shipped("models") / "policies" / name).is_file()]
 
 

@@ -117,7 +117,7 @@ def train_policy(
     if steps < 1:
         raise InputError(f"steps must be at least 1, not {steps}")
     if learned.encoder is None and (traits is not None or other_scene):
-        raise InputError(f"method {method} infers no traits; leave the trait model and other_scene out")
+        raise InputError(f"method {method} infers no traits; leave `traits` and `other_scene` out")
     encoder = _load_encoder(learned, traits)
     trained_in = described(scenes)
     if encoder is not None and not other_scene:

@@ -73,7 +73,7 @@ class Summary(ABC):
     def title(self) -> str:
         method = METHODS.get(self.method)
         title = self.method if method is None else method.title
-        return f"{title} (shipped)" if self.is_shipped else title
+        return f"{title} (old world)" if self.is_shipped else title
 
     @property
     def published(self) -> dict[str, float]:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.jobs import Job, Local
-from tint_sumo.jobs.jobs import Begun, Ended, News, run_jobs
+from tint_sumo.jobs.jobs import Ended, Event, Started, run_jobs
 from tint_sumo.methods.registry import METHODS, Learned
 from tint_sumo.study.budgets import BUDGETS, Budget, Conditions, Trials
 from tint_sumo.study.ceiling_job import CeilingJob
@@ -69,9 +69,9 @@ class Schedule:
     def start(self, job: Job) -> None:
         heapq.heappush(self._running, (self.now_s + self.times.of(job), next(self._numbers), job))
 
-    def listen(self, patience_s: float) -> list[tuple[Job, News]]:  # noqa: ARG002 - time is not spent here
+    def listen(self, patience_s: float) -> list[tuple[Job, Event]]:  # noqa: ARG002 - time is not spent here
         self.now_s, _, job = heapq.heappop(self._running)
-        return [(job, Begun()), (job, Ended("done"))]
+        return [(job, Started()), (job, Ended("done"))]
 
     def interrupt(self) -> None:
         pass

@@ -1,6 +1,7 @@
 """The package as users install it."""
 
 import ast
+import importlib.util
 import json
 import os
 import re
@@ -23,6 +24,15 @@ import tint_sumo
 from tint_sumo.core.files import write_text
 
 ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "scripts").glob("*.py")), ids=lambda script: script.stem)
+def test_scripts_import_what_is_there(script: Path) -> None:
+    for node in ast.walk(ast.parse(script.read_text())):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("tint_sumo"):
+            module = importlib.import_module(str(node.module))
+            for name in node.names:
+                assert hasattr(module, name.name) or importlib.util.find_spec(f"{node.module}.{name.name}"), name.name
 
 
 @pytest.fixture(scope="module")

@@ -124,6 +124,8 @@ def test_argument_errors_exit_with_2(argv: list[str], capsys: pytest.CaptureFixt
         ("policy train --method oracle --scene moon --out OUT", "unknown scene 'moon'"),
         ("policy train --method vae --traits nobody --out OUT", "no trait model nobody"),
         ("policy train --method vae --traits WIDE --out OUT", "3 latents where 2 are needed"),
+        ("traits relative --test old twons --out OUT.yaml", "unknown world 'twons'"),
+        ("policy export --model run.zip --out OUT", "run.zip is a pickle and is not exported"),
         ("policy evaluate --model nobody", "no policy nobody"),
         ("policy evaluate --model ttc --p-conservative 2", "p_conservative"),
         ("policy evaluate --model ttc --scene moon", "unknown scene 'moon'"),

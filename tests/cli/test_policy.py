@@ -92,7 +92,9 @@ def test_policies_are_trained_and_tested_in_worlds(tmp_path: Path, capsys: pytes
     out, small = tmp_path / "run", tmp_path / "small.yaml"
     small.write_text("scene: {time_limit_s: 1.0}\nbudget: {n_envs: 9, n_steps: 16, n_minibatches: 2}\n")
     train = ("policy", "train", "--method", "no_labels", "--config", small, "--steps", 1, "--out", out)
-    run(capsys, *train, "--world", "strangers")
+    trained = run(capsys, *train, "--world", "strangers")
+    assert trained["scene"].startswith("t_intersection-")  # with the changed time limit and the world's drivers
+    assert (trained["world"], len(trained["sensors"])) == ("strangers", 9)
     card = read_policy_card(out / "policy")
     assert len(card["sensors"]) == 9 and "sensor" not in card
     assert card["scene_settings"]["population"]["towns"]["count"] == 128
@@ -102,7 +104,12 @@ def test_policies_are_trained_and_tested_in_worlds(tmp_path: Path, capsys: pytes
     assert run(capsys, *tests, "--world", "delay_0.2")["sensor"] == "delay_0.2"
     both = ("--world", "towns", "--sensor", "range_15")
     assert "a world has a sensor; give --world or --sensor" in refuse(capsys, *tests, *both)
-    assert "a world has a sensor; give --world or --sensor" in refuse(capsys, *train, *both)
+    for sensor in ("range_15", "perfect"):
+        wrong = refuse(capsys, *train, "--world", "towns", "--sensor", sensor)
+        assert "a world has a sensor; give --world or --sensor" in wrong
+    train_in_all = ("policy", "train", "--method", "no_labels", "--out", out, "--scene", "all", "--world", "towns")
+    assert "a world is of one scene; give --world, or --scene all" in refuse(capsys, *train_in_all)
+    assert run(capsys, *tests, "--world", "delay_0.2")["world"] == "delay_0.2"
     assert "are for training, and a test has one sensor" in refuse(capsys, *tests, "--world", "strangers")
     assert "unknown world 'moon'" in refuse(capsys, *tests, "--world", "moon")
     assert "unknown world 'moon'" in refuse(capsys, *train, "--world", "moon")

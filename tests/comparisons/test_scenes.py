@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from tint_sumo.comparisons.scenes import SceneStudy, plan, report_markdown, run_scene_study
@@ -37,6 +39,28 @@ def test_models_are_trained_on_one_scene_and_on_all_and_tested_in_each(tmp_path:
     again = run_scene_study(STUDY, tmp_path, workers=1, progress=False)
     assert again.equals(table)
     assert finished == {file: file.stat().st_mtime_ns for file in (tmp_path / "results").iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"methods": ("magic",)}, "unknown trait method 'magic'"),
+        ({"scenes": ("t_intersection", "moon")}, "unknown scene 'moon'"),
+        ({"scenes": ("roundabout", "on_ramp")}, "scenes must be t_intersection, .* and at least one other"),
+        ({"scenes": ("t_intersection",)}, "scenes must be t_intersection, .* and at least one other"),
+        ({"seeds": (1, 1)}, "seeds must be one or more, each of them once"),
+    ],
+)
+def test_settings_that_cannot_be_compared_are_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        replace(STUDY, **wrong)
+
+
+def test_a_single_seed_has_no_spread() -> None:
+    row = {"method": "vae", "trained_on": "all", "scene": "on_ramp", "seed": 0, "accuracy": 0.9, "speed_r2": 0.5}
+    one, two = (report_markdown(pd.DataFrame([row, {**row, "seed": 1, "accuracy": 0.8}][:seeds])) for seeds in (1, 2))
+    assert "| 90.00 " in one and "| 0.50 " in one and "±" not in one
+    assert "| 85.00 ± 7.07 |" in two
 
 
 @pytest.fixture(scope="module")

@@ -78,8 +78,15 @@ def test_another_study_leaves_the_folder_alone(finished: Path) -> None:
 
 
 def test_bad_studies_are_refused_before_anything_is_written(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="unknown trait method 'magic'"):
-        run_trait_study(replace(SMALL, methods=("magic",)), tmp_path / "out")
+    for wrong, message in (
+        ({"methods": ("magic",)}, "unknown trait method 'magic'"),
+        ({"continuous_methods": ("magic",)}, "unknown trait method 'magic'"),
+        ({"seeds": (0, 0)}, "seeds must be one or more, each of them once"),
+        ({"other_p": (0.4, 0.4)}, "other_p must be one or more, each of them once"),
+        ({"p_conservative": 0.4, "other_p": (0.25, 0.4)}, "other_p has the mix of the training data, 0.4,"),
+    ):
+        with pytest.raises(InputError, match=message):
+            replace(SMALL, **wrong)
     with pytest.raises(InputError, match="workers must lie in 1 to 1,024"):
         run_trait_study(SMALL, tmp_path / "out", workers=0)
     with pytest.raises(InputError, match="no results in"):

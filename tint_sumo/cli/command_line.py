@@ -3,7 +3,7 @@
 import io
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -108,8 +108,15 @@ def _run(words: list[str]) -> int:
         return 130
     print(redact(outcome.text))
     if command.json:
-        print(redact(json.dumps(outcome.content)))
+        print(redact(_json_text(outcome.content)))
     return 0
+
+
+def _json_text(content: Mapping[str, Any]) -> str:
+    """Return JSON with null for numbers that are not finite, which JSON does not know."""
+    from pydantic_core import to_jsonable_python
+
+    return json.dumps(to_jsonable_python(content, inf_nan_mode="null"), allow_nan=False)
 
 
 def _refuse(message: str, exit_code: int) -> int:

@@ -28,7 +28,7 @@ from tint_sumo.cli.values import (
     WorldName,
     optional,
 )
-from tint_sumo.config import SENSORS, Decisions, EpisodesSeed, Fraction, Mix, NoiseM, Seed, Sensor, network_ppo
+from tint_sumo.config import PERFECT, SENSORS, Decisions, EpisodesSeed, Fraction, Mix, NoiseM, Seed, Sensor, network_ppo
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.ranges import Processes
@@ -54,7 +54,9 @@ _TRAITS = optional(
 )
 _MINARI = arg(metavar="NAME", help="Name of the dataset, such as tint_sumo/streaming-v0; needs tint_sumo[minari].")
 _ROOT = optional("FOLDER", "Folder of all datasets.", "Minari's: MINARI_DATASETS_PATH, or ~/.minari/datasets")
-_SENSOR = arg(help=f"Sensor that the ego perceives the others with: {', '.join(SENSORS)}.")
+_SENSOR = optional(
+    "NAME", f"Sensor that the ego perceives the others with: {', '.join(SENSORS)}.", "perfect, or those of the world"
+)
 _SET = arg(
     metavar="NAME=VALUE,VALUE [NAME=VALUE,VALUE ...]",
     help="Values of PPO's settings, all behind one --set, such as learning_rate=0.001,0.003 n_epochs=2,4; names of the "
@@ -82,7 +84,7 @@ class TrainPolicy(NetworkCommand):
     """Seed of the training, 0 to 1000."""
     budget: Annotated[PpoBudgetValue, _BUDGET] = "full"
     world: WorldName = None
-    sensor: Annotated[SensorValue, _SENSOR] = "perfect"
+    sensor: Annotated[SensorValue, _SENSOR] = None
     scene: Annotated[SceneValue, arg(help=f"Scene: {SCENES}, or all but t_intersection_street at once: all.")] = (
         "t_intersection"
     )
@@ -98,12 +100,14 @@ class TrainPolicy(NetworkCommand):
         from tint_sumo.films.training_films import film_policy
         from tint_sumo.jobs.table import one_job
         from tint_sumo.methods.training import train_policy
-        from tint_sumo.scenes import find_scene, find_scenes
+        from tint_sumo.scenes import ALL_SCENES, find_scene, find_scenes
 
         use_one_thread()
-        scene, sensors = self.scene_of(self.scene), [find_sensor(self.sensor)]
+        scene, sensors = self.scene_of(self.scene), [PERFECT if self.sensor is None else find_sensor(self.sensor)]
         if self.world is not None:
-            require_one_sensor(None if self.sensor == TrainPolicy.sensor else self.sensor)
+            require_one_sensor(self.sensor)
+            if scene == ALL_SCENES:
+                raise InputError(f"a world is of one scene; give `world`, or `scene` {ALL_SCENES}")
             world = find_world(self.world)
             scene, sensors = scene_in(world, find_scene(scene)), list(world.sensors)
         is_given = self.p_conservative != TrainPolicy.p_conservative
@@ -132,6 +136,9 @@ class TrainPolicy(NetworkCommand):
         content = {
             "model": str(policy),
             "method": self.method,
+            "scene": ALL_SCENES if scene == ALL_SCENES else first.name,
+            "world": self.world,
+            "sensors": [sensor_name(sensor) for sensor in sensors],
             "p_conservative": self.p_conservative if has_mix else None,
         }
         return Outcome(f"trained {self.method}: {policy}", {**content, "steps": steps, "seed": self.seed})
@@ -166,7 +173,7 @@ class PolicyCommand(NetworkCommand):
             "scene": task.scene.name,
             "world": self.world,
             "p_conservative": plain(task.p_conservative),
-            "sensor": next((name for name, known in SENSORS.items() if known == task.sensor), plain(task.sensor)),
+            "sensor": sensor_name(task.sensor),
             "position_noise_m": task.sensor.noise_m,
             "tau_s": task.played.tau_s,
         }
@@ -296,6 +303,8 @@ class ExportPolicy(NetworkCommand):
         from tint_sumo.methods.loading import load_policy
 
         use_one_thread()
+        if self.model.endswith(".zip"):
+            raise InputError(f"{self.model} is a pickle and is not exported; give the .safetensors file beside it")
         contender = load_policy(self.model, scene=self.scene_of(self.scene))
         with exporting_onnx():
             files = [str(file) for file in export_policy(contender, self.out, with_onnx=self.onnx)]
@@ -341,8 +350,7 @@ class SweepPolicy(SpreadCommand):
             table = run_sweep(sweep, out, workers=workers)
         files = [name_in(self.out, name) for name in ("sweep.csv", "sweep.md")]
         text = "\n".join([report_markdown(table, self.episodes), *wrote(files)])
-        rows = table.astype(object).where(table.notna(), None).to_dict("records")
-        return Outcome(text, {"results": rows, "files": files})
+        return Outcome(text, {"results": table.to_dict("records"), "files": files})
 
 
 @dataclass(frozen=True)
@@ -356,6 +364,11 @@ class Policy:
         | Annotated[ExportPolicy, subcommand("export")]
         | Annotated[SweepPolicy, subcommand("sweep")]
     )
+
+
+def sensor_name(sensor: Sensor) -> Any:
+    """Return the name of a sensor, or its values if it has none."""
+    return next((name for name, known in SENSORS.items() if known == sensor), plain(sensor))
 
 
 def require_one_sensor(sensor: "str | Sensor | None") -> None:

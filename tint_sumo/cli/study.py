@@ -44,7 +44,8 @@ class RunStudy(SpreadCommand):
             with self.workers_of(self.workers, self.gpus_per_job) as workers:
                 report = run_study(BUDGET.full(self.budget), out, scene=self.scene, workers=workers)
             found = sorted(out.glob("traits/*/latent.png")) + sorted(out.glob("policies/*/policy.safetensors"))
-            made = names_in(out_name, out, [out / DATASET, *found])
+            data = [out / DATASET] if (out / DATASET).exists() else []  # none where the shipped trait models are taken
+            made = names_in(out_name, out, [*data, *found])
         outcome = _report_outcome(report, out_name, out)
         text = "\n".join([outcome.text, *wrote(made)])
         return Outcome(text, {**outcome.content, "made": made})

@@ -155,10 +155,13 @@ class FitRelative(Command):
     """Seed of the traffic."""
 
     def run(self) -> Outcome:
+        from tint_sumo.envs.worlds import find_world
         from tint_sumo.traits.relative_fit import fit_relative, traffic_in
         from tint_sumo.traits.relative_reading import beliefs
 
         require_output_file(self.out, (".yaml", ".yml"))
+        for name in self.test:
+            find_world(name)
         use_one_thread()
         settings = fit_relative(traffic_in(self.world, self.scene, 2 * self.seed))
         found = {name: beliefs(settings, traffic_in(name, self.scene, 2 * self.seed + 1)) for name in self.test}
@@ -173,7 +176,9 @@ class FitRelative(Command):
             f"calibration error {percent(one['calibration_error'], 3)}%"
             for name, one in scores.items()
         ]
-        return Outcome("\n".join([*lines, *wrote([str(self.out)])]), {"settings": plain(settings), "worlds": scores})
+        content = {"out": str(self.out), "world": self.world, "seed": self.seed}
+        text = "\n".join([*lines, *wrote([str(self.out)])])
+        return Outcome(text, {**content, "settings": plain(settings), "worlds": scores})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,17 +11,18 @@ import torch
 
 from tint_sumo import traits
 from tint_sumo.config import TRAIT_BUDGETS, Fraction, NoiseM, Seed, TrafficSeed, TraitSettings, WindowCount
+from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import claim_folder, read_record, write_json, write_text
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Report
-from tint_sumo.core.ranges import require_ranges
+from tint_sumo.core.ranges import require_distinct, require_ranges
 from tint_sumo.core.reading import RESULT_BYTES
 from tint_sumo.core.structures import Many
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, joined, load_drivers, load_labels, load_windows, split_by_episode
 from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
-from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION, find_scenes
+from tint_sumo.scenes import ALL_SCENES, T_INTERSECTION, find_scene, find_scenes
 from tint_sumo.scenes.geometry import Floats
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.tables import markdown_table
@@ -48,6 +49,15 @@ class SceneStudy:
 
     def __post_init__(self) -> None:
         require_ranges(self)
+        require_distinct(self, "methods", "seeds", "scenes")
+        for method in self.methods:
+            find_trait_method(method)
+        for scene in self.scenes:
+            find_scene(scene)
+        if T_INTERSECTION not in self.scenes or len(self.scenes) < 2:
+            raise InputError(
+                f"scenes must be {T_INTERSECTION}, which models are trained in alone, and at least one other"
+            )
 
 
 SCENE_STUDIES = {"full": SceneStudy()}
@@ -244,8 +254,13 @@ def _lines(table: pd.DataFrame, column: str, words: Callable[[Floats], str]) -> 
 
 
 def _accuracy(seeds: Floats) -> str:
-    return f"{percent(seeds.mean(), 2)} ± {100.0 * seeds.std(ddof=1):.2f}"
+    return percent(seeds.mean(), 2) + _spread(100.0 * seeds)
 
 
 def _r2(seeds: Floats) -> str:
-    return f"{seeds.mean():.2f} ± {seeds.std(ddof=1):.2f}"
+    return f"{seeds.mean():.2f}{_spread(seeds)}"
+
+
+def _spread(seeds: Floats) -> str:
+    """Return the standard deviation between seeds, and nothing where there is one."""
+    return f" ± {seeds.std(ddof=1):.2f}" if len(seeds) > 1 else ""

@@ -13,7 +13,7 @@ from tint_sumo.config import TRAIT_BUDGETS, Fraction, LatentCount, NoiseM, Seed,
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import claim_folder, write_json
 from tint_sumo.core.progress import Report, part_of
-from tint_sumo.core.ranges import Range, require_ranges
+from tint_sumo.core.ranges import Range, require_distinct, require_ranges
 from tint_sumo.core.structures import Many
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_windows, split_by_episode
@@ -50,6 +50,17 @@ class TraitStudy:
 
     def __post_init__(self) -> None:
         require_ranges(self)
+        require_distinct(self, "methods", "noises_m", "seeds")
+        if self.continuous_methods:
+            require_distinct(self, "continuous_methods", "continuous_latents", "continuous_seeds")
+        if self.other_p:
+            require_distinct(self, "other_p")
+        for method in (*self.methods, *self.continuous_methods):
+            find_trait_method(method)
+        if self.p_conservative in self.other_p:
+            raise InputError(
+                f"other_p has the mix of the training data, {self.p_conservative:g}, tested anyway; leave it out"
+            )
         if self.settings.noise_m != 0.0:
             raise InputError("settings.noise_m has no use, since every noise of noises_m is trained with; leave it out")
 
@@ -71,8 +82,6 @@ def run_trait_study(study: TraitStudy, out: Path, *, workers: Workers = 2, progr
         JobError: jobs were given up; all others are done.
     """
     executor = executor_of(workers)
-    for method in study.methods:
-        find_trait_method(method)
     with claim_folder(out, {"kind": "trait study", **asdict(study)}):
         for folder, windows, p_conservative in _recordings(study, out):
             record(

@@ -63,6 +63,8 @@ def measure(name: str, world: str, cases: int) -> dict[str, str]:
 def measure_all(runs: Path, cases: int, out: Path) -> list[dict[str, str]]:
     """Return the rows of all policies, and write them to ``out`` as they come; those that it has already are kept."""
     rows = list(csv.DictReader(out.read_text().splitlines())) if out.exists() else []
+    if {row["cases"] for row in rows} - {str(cases)}:
+        raise SystemExit(f"{out} has other numbers of cases than {cases}; give it another --out")
     known = {(row["trained_in"], row["method"], row["seed"], row["world"], row["cases"]) for row in rows}
     for trained_in, method, name in contenders(runs):
         for world in STRANGERS_TESTS:

@@ -241,7 +241,7 @@ def find_entry(entry: str) -> str | Policy | Function:
         return entry
     try:
         found: Policy | Function = getattr(import_module(module), name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:  # ValueError: no module's name
         raise InputError(f"{entry} cannot be imported ({error}); give MODULE:NAME") from None
     return found
 

@@ -567,6 +567,27 @@ def test_what_a_method_has_no_use_for_is_refused(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("method", ["vae", "relative", "ma", "no_labels"])
+@pytest.mark.parametrize("own", [False, True])
+def test_traits_are_inferred_in_no_other_steps_than_trait_models_read(
+    tmp_path: Path, tiny: PpoSettings, user_network: Callable[[str], UserNetwork], method: str, own: bool
+) -> None:
+    slow = read_scene({"base": "t_intersection", "step_s": 0.2, "name": "slow"})
+    scene, mix = (user_network("grid").scene(), None) if own else (slow, Mix(0.4))
+    settings = replace(tiny, motion=method == "no_labels")
+    line = r"scene (grid|slow) has steps of (1|0\.2) s, and traits are inferred in steps of 0\.1 s; set its step_s"
+    with pytest.raises(InputError, match=line):
+        train_policy(method, mix, 64, 0, tmp_path / "run", settings=settings, scene=scene)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_policy_that_infers_traits_drives_in_no_other_steps(tmp_path: Path, tiny: PpoSettings) -> None:
+    policy = train_policy("no_labels", Mix(0.4), 64, 0, tmp_path, settings=replace(tiny, motion=True))
+    contender = load_policy(policy, scene=read_scene({"base": "t_intersection", "step_s": 0.2}))
+    with pytest.raises(InputError, match=r"traits are inferred in steps of 0\.1 s"):
+        contender.make_venv(1, contender.task)
+
+
 # Trait models
 
 

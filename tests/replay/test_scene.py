@@ -70,6 +70,21 @@ def test_persons_on_foot_are_no_cars(street: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("route", "lane", "y_m"), [(("ab",), "ab_1", -4.8), (("ab", "bc"), "ab_1", -4.8), (("ab", "bd"), "ab_2", -1.6)]
+)
+def test_an_ego_on_edges_begins_on_a_lane_for_cars_that_leads_on(
+    pavements: Path, route: tuple[str, ...], lane: str, y_m: float
+) -> None:
+    ego, far = EgoOnEdges(route, 12.0, 70.0, every_s=100.0), Driven("far", 100.0, -1.6, 1.0)
+    (case,) = from_tracks(pavements, recording([far]), ego).cases
+    assert case.lane == lane
+    np.testing.assert_allclose(case.way.box["y_m"][:100], y_m)
+    stands = Driven("stands", 12.0, y_m, 0.0)
+    with pytest.raises(InputError, match="no room at its start"):
+        from_tracks(pavements, recording([stands]), ego)
+
+
+@pytest.mark.parametrize(
     ("vehicles", "ego", "message"),
     [
         (

@@ -139,6 +139,11 @@ class TaskSettings:
         return round(self._decision_s / self._step_s)
 
     @property
+    def render_fps(self) -> float:
+        """Images per second that show episodes in real time, one for each step of the environment."""
+        return 1.0 / self._decision_s
+
+    @property
     def decisions_per_episode(self) -> int:
         """Most decisions in an episode."""
         return math.ceil(round(self.played.time_limit_s / self._step_s) / self.steps_per_decision)

@@ -22,6 +22,7 @@ import torch
 
 from tests.bombs import BOMBS, bomb
 from tests.methods import runs
+from tests.replay.recordings import LOWER_Y_M, Driven, recording, write_street
 from tests.scenes.networks import UserNetwork
 from tests.simulation.scenes import T
 from tint_sumo import traits
@@ -41,6 +42,7 @@ from tint_sumo.policy import ClassifierTraits, EncoderTraits, OracleTraits, Recu
 from tint_sumo.policy.loss import PpoLoss, ppo_loss
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.storage import load_policy_network, read_policy_card
+from tint_sumo.replay import from_tracks
 from tint_sumo.scenes import read_scene
 from tint_sumo.traits.storage import save
 
@@ -578,6 +580,13 @@ def test_traits_are_inferred_in_no_other_steps_than_trait_models_read(
     line = r"scene (grid|slow) has steps of (1|0\.2) s, and traits are inferred in steps of 0\.1 s; set its step_s"
     with pytest.raises(InputError, match=line):
         train_policy(method, mix, 64, 0, tmp_path / "run", settings=settings, scene=scene)
+    assert not (tmp_path / "run").exists()
+
+
+def test_nobody_trains_in_a_recording_which_a_card_cannot_describe(tmp_path: Path, tiny: PpoSettings) -> None:
+    scene = from_tracks(write_street(tmp_path), recording([Driven("west", 90.0, LOWER_Y_M, -10.0)]))
+    with pytest.raises(InputError, match="scene street is a recording"):
+        train_policy("no_labels", None, 64, 0, tmp_path / "run", settings=tiny, scene=scene)
     assert not (tmp_path / "run").exists()
 
 

@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 from tests.replay.recordings import LOWER_Y_M, UPPER_Y_M, Driven, built, recording
 from tint_sumo.core.errors import InputError
+from tint_sumo.envs import TaskSettings
+from tint_sumo.envs.entry_points import env_spec
 from tint_sumo.replay import EgoOnEdges, from_tracks
+from tint_sumo.scenes import described
 
 WEST = Driven("west", 90.0, LOWER_Y_M, -10.0)
 
@@ -166,3 +169,11 @@ def test_a_file_of_tracks_is_read(street: Path, tmp_path: Path) -> None:
     assert scene.name == "fcd"
     np.testing.assert_allclose(scene.recordings[0].box["x_m"], known.recordings[0].box["x_m"])
     assert scene.cases[0].goal_m == pytest.approx(known.cases[0].goal_m)
+
+
+def test_a_recording_is_not_described_as_a_sumo_configuration(street: Path) -> None:
+    """Its policy, or its dataset, could not be read again."""
+    scene = from_tracks(street, recording([WEST]))
+    for describe in (lambda: described([scene]), lambda: env_spec(TaskSettings(scene))):
+        with pytest.raises(InputError, match="scene street is a recording, which the files of policies and datasets"):
+            describe()

@@ -326,7 +326,6 @@ class Episodes:
         self._steps_per_decision = settings.steps_per_decision
         self.steps = np.zeros(num_envs, np.int64)  # simulation steps since each episode's start
         self._parked: set[int] = set()
-        self._reveals = any(task.sensor != PERFECT for task in all_settings)
         shares = shares_of(num_envs, len(all_settings))
         self._sensors = [
             (share, Sensing(task.sensor, self.simulation, scene.step_s))
@@ -441,8 +440,7 @@ class Episodes:
             observe_recording(self.simulation, rows)
         if self.settings.tracks:
             self._observe_tracks(sensing, envs)
-        if self._reveals:
-            reveal(egos.box[envs], slots.present[envs], slots.box[envs], traits, self._scales, rows)
+        reveal(egos.box[envs], slots.present[envs], slots.box[envs], traits, self._scales, rows)
         sensing.delay(self.steps, envs, rows)
 
     def _observe_tracks(self, sensing: Sensing, envs: slice) -> None:

@@ -89,8 +89,10 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         first = settings[0]
         if len({task.played.max_vehicles for task in settings}) > 1:
             raise InputError("scenes of one environment must observe the same number of vehicles; change max_vehicles")
-        if len({task.contents._replace(slot_infos=()) for task in settings}) > 1:
-            raise InputError("scenes of one environment must have the same `perceives` and `red_light`; change them")
+        if len({(task.tracks, task.contents._replace(slot_infos=())) for task in settings}) > 1:
+            raise InputError(
+                "scenes of one environment must have the same `tracks`, `perceives` and `red_light`; change them"
+            )
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         more = {"autoreset_mode": self.autoreset_mode, "render_fps": first.render_fps}
         self.metadata = {**self.metadata, **more}

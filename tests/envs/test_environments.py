@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -19,7 +20,7 @@ from tint_sumo.envs.rows import TRACKS
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.envs.scene_env import SceneEnv
 from tint_sumo.envs.vector import SceneVectorEnv
-from tint_sumo.scenes import T_INTERSECTION
+from tint_sumo.scenes import T_INTERSECTION, find_scene
 
 ENV_ID = ENV_IDS[T_INTERSECTION]
 GO, STOP = 2, 0
@@ -301,6 +302,15 @@ def test_rendering_shows_every_vehicle() -> None:
         vehicles = int((info["traits"] == value).sum())
         assert pixels == pytest.approx(vehicles * 5 * 2 * 16 * 16 * 0.85, rel=0.2)  # less the windscreens
     env.close()
+
+
+@pytest.mark.parametrize(("step_s", "decision_s", "fps"), [(0.1, None, 10.0), (0.5, None, 2.0), (0.5, 1.0, 1.0)])
+def test_pictures_are_shown_in_real_time_whatever_the_step(step_s: float, decision_s: float | None, fps: float) -> None:
+    scene = replace(find_scene(T_INTERSECTION), name="other", base=T_INTERSECTION, step_s=step_s)
+    task = TaskSettings(scene, decision_s=decision_s)
+    for made in (SceneEnv(task), SceneVectorEnv(1, task)):
+        made.close()
+        assert made.metadata["render_fps"] == fps
 
 
 @pytest.mark.parametrize(

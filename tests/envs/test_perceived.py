@@ -204,7 +204,7 @@ def test_settings_that_make_no_sense_are_refused(scene: SumocfgScene, changes: d
 
 def test_scenes_of_one_vector_must_observe_the_same(scene: SumocfgScene) -> None:
     tasks = [TaskSettings(scene), TaskSettings(replace(scene, perceives=("lane",)))]
-    with pytest.raises(InputError, match="must have the same `perceives` and `red_light`"):
+    with pytest.raises(InputError, match="must have the same `tracks`, `perceives` and `red_light`"):
         SceneVectorEnv(2, tasks)
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,20 @@ def assert_infos_equal(first: Any, second: Any) -> None:
     else:
         assert np.asarray(first).dtype == np.asarray(second).dtype
         assert_equal(first, second)
+
+
+def test_the_truth_is_shown_beside_a_perfect_sensor_where_another_scene_has_one_that_is_not() -> None:
+    with closing(SceneVectorEnv(2, [TaskSettings("four_way"), TaskSettings("on_ramp", sensor="range_15")])) as vector:
+        _, infos = vector.reset(seed=3)
+        for _ in range(3):
+            np.testing.assert_array_equal(infos["true_traits"][0], infos["traits"][0])
+            assert infos["true_mask"][0].sum() == (infos["traits"][0] >= 0).sum() > 0
+            *_, infos = vector.step(np.zeros(2, np.int64))
+
+
+def test_tracks_are_shown_in_all_scenes_of_a_vector_or_in_none() -> None:
+    with pytest.raises(InputError, match="must have the same `tracks`"):
+        SceneVectorEnv(2, [TaskSettings("four_way", tracks=True), TaskSettings("on_ramp")])
 
 
 def test_the_stable_baselines3_adapter_takes_workers() -> None:

@@ -22,6 +22,7 @@ import torch
 
 from tests.bombs import BOMBS, bomb
 from tests.methods import runs
+from tests.replay.recordings import LOWER_Y_M, Driven, recording, write_street
 from tests.scenes.networks import UserNetwork
 from tests.simulation.scenes import T
 from tint_sumo import traits
@@ -41,6 +42,7 @@ from tint_sumo.policy import ClassifierTraits, EncoderTraits, OracleTraits, Recu
 from tint_sumo.policy.loss import PpoLoss, ppo_loss
 from tint_sumo.policy.network import GruPolicy
 from tint_sumo.policy.storage import load_policy_network, read_policy_card
+from tint_sumo.replay import from_tracks
 from tint_sumo.scenes import read_scene
 from tint_sumo.traits.storage import save
 
@@ -583,6 +585,34 @@ def test_what_a_method_has_no_use_for_is_refused(
     with pytest.raises(InputError, match=message):
         train_policy(method, Mix(0.4), 64, 0, tmp_path / "run", **{"settings": tiny, **given})
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("method", ["vae", "relative", "ma", "no_labels"])
+@pytest.mark.parametrize("own", [False, True])
+def test_traits_are_inferred_in_no_other_steps_than_trait_models_read(
+    tmp_path: Path, tiny: PpoSettings, user_network: Callable[[str], UserNetwork], method: str, own: bool
+) -> None:
+    slow = read_scene({"base": "t_intersection", "step_s": 0.2, "name": "slow"})
+    scene, mix = (user_network("grid").scene(), None) if own else (slow, Mix(0.4))
+    settings = replace(tiny, motion=method == "no_labels")
+    line = r"scene (grid|slow) has steps of (1|0\.2) s, and traits are inferred in steps of 0\.1 s; set its step_s"
+    with pytest.raises(InputError, match=line):
+        train_policy(method, mix, 64, 0, tmp_path / "run", settings=settings, scene=scene)
+    assert not (tmp_path / "run").exists()
+
+
+def test_nobody_trains_in_a_recording_which_a_card_cannot_describe(tmp_path: Path, tiny: PpoSettings) -> None:
+    scene = from_tracks(write_street(tmp_path), recording([Driven("west", 90.0, LOWER_Y_M, -10.0)]))
+    with pytest.raises(InputError, match="scene street is a recording"):
+        train_policy("no_labels", None, 64, 0, tmp_path / "run", settings=tiny, scene=scene)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_policy_that_infers_traits_drives_in_no_other_steps(tmp_path: Path, tiny: PpoSettings) -> None:
+    policy = train_policy("no_labels", Mix(0.4), 64, 0, tmp_path, settings=replace(tiny, motion=True))
+    contender = load_policy(policy, scene=read_scene({"base": "t_intersection", "step_s": 0.2}))
+    with pytest.raises(InputError, match=r"traits are inferred in steps of 0\.1 s"):
+        contender.make_venv(1, contender.task)
 
 
 # Trait models

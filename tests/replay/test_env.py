@@ -328,3 +328,20 @@ def test_the_vehicle_that_the_ego_has_taken_over_does_not_come_again(street: Pat
             env.step(np.int64(FAST))
             seen |= boxes(env).keys()
         assert seen == {"follower"}
+
+
+@pytest.mark.parametrize("route", [("ab", "bc"), ("ab", "bd")])
+def test_an_ego_on_edges_drives_the_way_that_others_expect(pavements: Path, route: tuple[str, ...]) -> None:
+    ego = EgoOnEdges(route, start_m=12.0, goal_m=100.0, every_s=100.0)
+    with made(pavements, recording([Driven("far", 120.0, -1.6, 1.0)]), ego=ego) as env:
+        env.reset(seed=0)
+        simulation, way = simulation_of(env), simulation_of(env).scene.cases[0].way
+        over = False
+        while not over:
+            _, _, terminated, truncated, info = env.step(np.int64(FAST))
+            over = terminated or truncated
+            driven_m = simulation.egos.front_m[0] - ego.start_m
+            box, expected = simulation.egos.box[0], way.box[np.abs(way.driven_m - driven_m).argmin()]
+            x_m, y_m = box["x_m"] + simulation.origin_m[0], box["y_m"] + simulation.origin_m[1]
+            assert np.hypot(x_m - expected["x_m"], y_m - expected["y_m"]) < 2.0
+        assert info["outcome"] == "success"

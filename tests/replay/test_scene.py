@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 from tests.replay.recordings import LOWER_Y_M, UPPER_Y_M, Driven, built, recording
 from tint_sumo.core.errors import InputError
+from tint_sumo.envs import TaskSettings
+from tint_sumo.envs.entry_points import env_spec
 from tint_sumo.replay import EgoOnEdges, from_tracks
+from tint_sumo.scenes import described
 
 WEST = Driven("west", 90.0, LOWER_Y_M, -10.0)
 
@@ -67,6 +70,21 @@ def test_persons_on_foot_are_no_cars(street: Path) -> None:
     assert [scene.recordings[0].vehicles[case.track] for case in scene.cases] == ["west"]
     with pytest.raises(InputError, match="the ego cannot take over vehicle walker, which is no car"):
         from_tracks(street, recording([WEST, walker]), "walker")
+
+
+@pytest.mark.parametrize(
+    ("route", "lane", "y_m"), [(("ab",), "ab_1", -4.8), (("ab", "bc"), "ab_1", -4.8), (("ab", "bd"), "ab_2", -1.6)]
+)
+def test_an_ego_on_edges_begins_on_a_lane_for_cars_that_leads_on(
+    pavements: Path, route: tuple[str, ...], lane: str, y_m: float
+) -> None:
+    ego, far = EgoOnEdges(route, 12.0, 70.0, every_s=100.0), Driven("far", 100.0, -1.6, 1.0)
+    (case,) = from_tracks(pavements, recording([far]), ego).cases
+    assert case.lane == lane
+    np.testing.assert_allclose(case.way.box["y_m"][:100], y_m)
+    stands = Driven("stands", 12.0, y_m, 0.0)
+    with pytest.raises(InputError, match="no room at its start"):
+        from_tracks(pavements, recording([stands]), ego)
 
 
 @pytest.mark.parametrize(
@@ -151,3 +169,11 @@ def test_a_file_of_tracks_is_read(street: Path, tmp_path: Path) -> None:
     assert scene.name == "fcd"
     np.testing.assert_allclose(scene.recordings[0].box["x_m"], known.recordings[0].box["x_m"])
     assert scene.cases[0].goal_m == pytest.approx(known.cases[0].goal_m)
+
+
+def test_a_recording_is_not_described_as_a_sumo_configuration(street: Path) -> None:
+    """Its policy, or its dataset, could not be read again."""
+    scene = from_tracks(street, recording([WEST]))
+    for describe in (lambda: described([scene]), lambda: env_spec(TaskSettings(scene))):
+        with pytest.raises(InputError, match="scene street is a recording, which the files of policies and datasets"):
+            describe()

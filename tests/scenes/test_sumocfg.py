@@ -67,11 +67,6 @@ def test_all_that_is_in_sight_and_all_of_the_way_is_within_the_bounds_of_observa
     assert (near.position_scale_m, near.ego_scale_m) == (20.0, 20.0)  # as in the built-in scenes
 
 
-def test_long_steps_do_not_make_the_ego_overshoot(user_network: Make) -> None:
-    assert user_network("grid").scene().ego.controller.gain_per_s == 1.0
-    assert user_network("merge").scene().ego.controller.gain_per_s == 2.0
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -1,12 +1,14 @@
 """The ego's control and its safety check; nothing is simulated."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import count, product
 
 import numpy as np
 import pytest
 
+from tests.scenes.networks import UserNetwork
 from tint_sumo.config import DRIVER_PROFILES
 from tint_sumo.scenes import T_INTERSECTION, find_scene
 from tint_sumo.scenes.geometry import BOX, Boxes, clearance_m, place
@@ -70,6 +72,21 @@ def test_the_rules_are_those_of_the_scene() -> None:
     controller = replace(T.ego.controller, **dict(zip(CONTROLLER, count(2.0), strict=False)), watches_behind=False)
     rules = EgoRules.of(replace(T, ego=replace(T.ego, controller=controller), step_s=0.05))
     assert rules == EgoRules(*(getattr(controller, name) for name in CONTROLLER), False, 0.05)
+
+
+@pytest.mark.parametrize("step_s", [0.1, 0.5, 1.0])
+def test_the_ego_keeps_its_desired_speed_in_steps_of_any_length(step_s: float) -> None:
+    rules, speed_mps, speeds_mps = EgoRules.of(replace(T, step_s=step_s)), np.zeros(1), list[float]()
+    for _ in range(30):
+        drive(np.array([0.5]), np.zeros(1, bool), rules, speed_mps, np.zeros(1))
+        speeds_mps.append(float(speed_mps[0]))
+    assert max(speeds_mps) <= 0.5
+    assert speeds_mps[-1] == pytest.approx(0.5, abs=0.01)
+
+
+def test_the_ego_does_not_overshoot_in_sumo_configurations(user_network: Callable[[str], UserNetwork]) -> None:
+    assert EgoRules.of(user_network("grid").scene()).gain_per_s == 1.0
+    assert EgoRules.of(user_network("merge").scene()).gain_per_s == 2.0
 
 
 def test_egos_move_by_their_new_speed_and_never_backwards() -> None:

@@ -217,3 +217,10 @@ def test_unknown_methods_and_too_few_workers_leave_no_folder(budget: Budget, tmp
         with pytest.raises(InputError, match=f"{name}"):
             run_study(replace(budget, methods=(name,)), tmp_path / "study")
     assert not (tmp_path / "study").exists()
+
+
+def test_a_study_is_in_the_steps_in_which_traits_are_inferred(budget: Budget, tmp_path: Path) -> None:
+    slow = replace(find_scene("t_intersection"), name="slow", base="t_intersection", step_s=0.2)
+    with pytest.raises(InputError, match=r"scene slow has steps of 0\.2 s, and traits are inferred in steps of 0\.1 s"):
+        run_study(budget, tmp_path / "study", scene=slow)
+    assert not (tmp_path / "study").exists()

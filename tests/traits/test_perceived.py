@@ -77,3 +77,9 @@ def test_windows_follow_from_the_seed() -> None:
     np.testing.assert_array_equal(first.states, again.states)
     with pytest.raises(InputError, match=r"steps must lie in 1 to 10,000,000, not 0"):
         perceived_windows(TASK, 0)
+
+
+def test_windows_have_no_other_steps_than_trait_models_read() -> None:
+    slow = replace(paper_scene(), name="slow", base="t_intersection", step_s=0.2)
+    with pytest.raises(InputError, match=r"scene slow has steps of 0\.2 s, and traits are inferred in steps of 0\.1 s"):
+        perceived_windows(replace(TASK, scene=slow), 130, num_envs=1)

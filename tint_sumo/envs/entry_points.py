@@ -97,7 +97,7 @@ def env_spec(task: TaskSettings) -> EnvSpec:
     """Return gymnasium's specification of the environment with these settings, which can be written as JSON.
 
     Raises:
-        InputError: the scene cannot be described: its roads are those of no built-in scene.
+        InputError: the scene cannot be described, as in ``tint_sumo.scenes.scene_settings``.
     """
     default = TaskSettings()
     arguments = {field.name: getattr(task, field.name) for field in fields(task)}

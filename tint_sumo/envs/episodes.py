@@ -139,6 +139,11 @@ class TaskSettings:
         return round(self._decision_s / self._step_s)
 
     @property
+    def render_fps(self) -> float:
+        """Images per second that show episodes in real time, one for each step of the environment."""
+        return 1.0 / self._decision_s
+
+    @property
     def decisions_per_episode(self) -> int:
         """Most decisions in an episode."""
         return math.ceil(round(self.played.time_limit_s / self._step_s) / self.steps_per_decision)
@@ -321,7 +326,6 @@ class Episodes:
         self._steps_per_decision = settings.steps_per_decision
         self.steps = np.zeros(num_envs, np.int64)  # simulation steps since each episode's start
         self._parked: set[int] = set()
-        self._reveals = any(task.sensor != PERFECT for task in all_settings)
         shares = shares_of(num_envs, len(all_settings))
         self._sensors = [
             (share, Sensing(task.sensor, self.simulation, scene.step_s))
@@ -436,8 +440,7 @@ class Episodes:
             observe_recording(self.simulation, rows)
         if self.settings.tracks:
             self._observe_tracks(sensing, envs)
-        if self._reveals:
-            reveal(egos.box[envs], slots.present[envs], slots.box[envs], traits, self._scales, rows)
+        reveal(egos.box[envs], slots.present[envs], slots.box[envs], traits, self._scales, rows)
         sensing.delay(self.steps, envs, rows)
 
     def _observe_tracks(self, sensing: Sensing, envs: slice) -> None:

@@ -26,11 +26,6 @@ _PALENESS = 0.65  # part of the road's colour in that of a vehicle that is not s
 _FAR_M = 1000.0  # beyond every picture
 
 
-def render_fps(decision_s: float | None) -> float:
-    """Return the images per second that show episodes in real time, one for each step of the environment."""
-    return RENDER_FPS if decision_s is None else 1.0 / decision_s
-
-
 def require_render_mode(render_mode: str | None, choices: Sequence[str]) -> None:
     if render_mode is not None and render_mode not in choices:
         raise InputError(f"unknown render_mode {render_mode!r}; choose one of None, {', '.join(map(repr, choices))}")

@@ -24,7 +24,7 @@ from tint_sumo.envs.calls import (
     checked_seeds,
 )
 from tint_sumo.envs.episodes import TaskSettings, action_space, fingerprints, share_simulation
-from tint_sumo.envs.rendering import RENDER_FPS, render_fps, require_render_mode
+from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
 from tint_sumo.envs.rows import (
     GOING_ON,
     Observation,
@@ -89,11 +89,13 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         first = settings[0]
         if len({task.played.max_vehicles for task in settings}) > 1:
             raise InputError("scenes of one environment must observe the same number of vehicles; change max_vehicles")
-        if len({task.contents._replace(slot_infos=()) for task in settings}) > 1:
-            raise InputError("scenes of one environment must have the same `perceives` and `red_light`; change them")
+        if len({(task.tracks, task.contents._replace(slot_infos=())) for task in settings}) > 1:
+            raise InputError(
+                "scenes of one environment must have the same `tracks`, `perceives` and `red_light`; change them"
+            )
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        fps = render_fps(first.decision_s)
-        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode, "render_fps": fps}
+        more = {"autoreset_mode": self.autoreset_mode, "render_fps": first.render_fps}
+        self.metadata = {**self.metadata, **more}
         self.num_envs = num_envs
         self.contents = max((task.contents for task in settings), key=lambda contents: len(contents.slot_infos))
         self.render_mode = render_mode

@@ -39,7 +39,7 @@ from tint_sumo.methods.registry import Learned, find_learned
 from tint_sumo.policy import GruPolicy, RecurrentPPO
 from tint_sumo.policy.storage import load_policy_network, read_policy_card, save_policy
 from tint_sumo.policy.wrappers import policy_venv
-from tint_sumo.scenes import T_INTERSECTION, AnyScene, described, find_scenes
+from tint_sumo.scenes import T_INTERSECTION, AnyScene, described, find_scenes, require_trait_steps
 from tint_sumo.scenes.drivers import require_two_kinds
 from tint_sumo.traits import TraitModel
 from tint_sumo.traits.storage import read_card, require_scene, save
@@ -119,6 +119,8 @@ def train_policy(
     if learned.encoder is None and (traits is not None or other_scene):
         raise InputError(f"method {method} infers no traits; leave `traits` and `other_scene` out")
     encoder = _load_encoder(learned, traits)
+    for one in scenes if learned.make_source(encoder, settings).needs_tracks else ():
+        require_trait_steps(one)
     trained_in = described(scenes)
     if encoder is not None and not other_scene:
         require_scene(traits or str(learned.encoder), trained_in["scene"], trained_in["scene_digest"], "the policy")

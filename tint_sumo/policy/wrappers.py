@@ -16,6 +16,7 @@ from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import COST
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy.trait_sources import Frame, Observation, OracleTraits, TraitSource, WithMotion
+from tint_sumo.scenes import require_trait_steps
 
 TRAITS, TRUE_TRAITS = "traits", "true_traits"
 _NEEDED = frozenset({"ego", "vehicles", "mask"})
@@ -184,8 +185,14 @@ def policy_venv(
         monitored: count steps and rewards of each episode for Stable-Baselines3's logger.
         on_step: called with every step of the simulation, as in ``ActionRepeat``; the environments then show the end of
             an episode until they are parked or reset.
+
+    Raises:
+        InputError: the source takes tracks, and a scene has steps of another length than those that traits are
+            inferred in.
     """
     tracks = source is not None and source.needs_tracks
+    for task in settings if tracks else ():
+        require_trait_steps(task.scene)
     seen = [replace(task, tracks=tracks) for task in settings]
     if seen[0].scene.sumocfg:  # one simulation per process
         seen *= num_envs

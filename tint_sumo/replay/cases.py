@@ -169,8 +169,9 @@ def _on_edges(ego: EgoOnEdges, number: int, recording: Recording, routes: Routes
     edge_start_m, spans_m, length_m = measure_route(routes.net, ego.edges)
     require_on_route(ego.start_m, ego.goal_m, spans_m, length_m)
     edge = max(index for index, start_m in enumerate(edge_start_m) if start_m <= ego.start_m)
-    lane = routes.net.getEdge(ego.edges[edge]).getLanes()[0]
-    way = _way_along(ego, routes)
+    lane_m = ego.start_m - edge_start_m[edge]
+    lanes = routes.ego_lanes(ego.edges[edge:])
+    way = _way_along(ego, lanes, lane_m, routes.net)
     steps = range(0, recording.steps - round(_LEAST_S / step_s) + 1, max(1, round(ego.every_s / step_s)))
     return [
         ReplayCase(
@@ -182,8 +183,8 @@ def _on_edges(ego: EgoOnEdges, number: int, recording: Recording, routes: Routes
             route_edge_start_m=edge_start_m,
             start_m=ego.start_m,
             goal_m=ego.goal_m,
-            lane=str(lane.getID()),
-            lane_m=ego.start_m - edge_start_m[edge],
+            lane=lanes[0][0],
+            lane_m=lane_m,
             speed_mps=ego.speed_mps,
             vehicle=ego.vehicle,
             way=way,
@@ -201,19 +202,23 @@ def _has_room(box: Any, recording: Recording, step: int) -> bool:
     return all(clearance_m(other, box) > 0.0 for other in here)
 
 
-def _way_along(ego: EgoOnEdges, routes: Routes) -> Way:
-    """Return the boxes of an ego along the lanes of its route, from its start to its goal."""
-    lanes: dict[float, str] = {}  # the first that begins there
-    for lane, start_m in routes.lane_starts_m(ego.edges).items():
-        lanes.setdefault(start_m, lane)
-    points, along_m = [], []
-    for start_m, name in sorted(lanes.items()):
-        lane = routes.net.getLane(name)
+def _way_along(ego: EgoOnEdges, lanes: Sequence[tuple[str, Sequence[str]]], lane_m: float, net: Any) -> Way:
+    """Return the boxes of an ego along lanes, from its start to its goal.
+
+    Args:
+        ego: on its edges.
+        lanes: that it takes from its start on, as ``Routes.ego_lanes`` has them.
+        lane_m: position of its front on the first of them.
+        net: the network.
+    """
+    points, along_m, end_m = list[tuple[float, float]](), list[float](), ego.start_m - lane_m
+    for lane in (net.getLane(name) for on_edge, over in lanes for name in (on_edge, *over)):
         line = shapely.LineString(lane.getShape())
         for share in np.linspace(0.0, 1.0, max(2, int(line.length / _SPACING_M))):
             point = line.interpolate(share, normalized=True)
             points.append((point.x, point.y))
-            along_m.append(start_m + share * float(lane.getLength()))
+            along_m.append(end_m + share * float(lane.getLength()))
+        end_m = along_m[-1]
     line_m, at = np.array(along_m), np.array(points)
     wanted_m: Floats = np.arange(ego.start_m, ego.goal_m, _SPACING_M)
     front, back = (

@@ -1,13 +1,15 @@
 """Routes over the lanes on which vehicles were recorded, and lengths along them."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from itertools import groupby, pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
+
+from tint_sumo.scenes.sumocfg import EGO_CLASS
 
 _JUNCTION = ":"  # lanes and edges on junctions begin so
 NO_LANE = ""
@@ -16,6 +18,20 @@ NO_LANE = ""
 def is_on_edge(lane: str) -> bool:
     """Return whether there is such a lane, and it is on no junction."""
     return lane != NO_LANE and not lane.startswith(_JUNCTION)
+
+
+class _Ahead(NamedTuple):
+    """What is ahead of a lane."""
+
+    edges: int  # of the route over which it leads, its own included, until an ego would have to change lanes
+    way: Any  # the connection to the next of them; None on the last
+
+
+def _ahead(lane: Any, after: Mapping[str, _Ahead]) -> _Ahead:
+    """Return what is ahead of a lane, if this is ahead of the lanes of the next edge."""
+    ways = [way for way in lane.getOutgoing() if way.getToLane().getID() in after]
+    best = max(ways, key=lambda way: after[way.getToLane().getID()].edges, default=None)
+    return _Ahead(1, None) if best is None else _Ahead(1 + after[best.getToLane().getID()].edges, best)
 
 
 class Routes:
@@ -97,6 +113,30 @@ class Routes:
                     lengths_m[-1] += float(self.net.getLane(lane).getLength())
             start_m += min(lengths_m, default=0.0)
         return found
+
+    def ego_lanes(self, route: Sequence[str]) -> list[tuple[str, list[str]]]:
+        """Return the lanes that an ego takes: one on each edge of a route, and those over the junction behind it.
+
+        It stays in its lane if that leads on. Otherwise, and at first, it takes the lane that leads on over most edges.
+        """
+        found: list[tuple[str, list[str]]] = []
+        entered = ""
+        for open_lanes in self._open_lanes(route):
+            lane, (_, way) = max(
+                open_lanes.items(), key=lambda one: (one[1].way is not None, one[0] == entered, one[1].edges)
+            )
+            entered = "" if way is None else way.getToLane().getID()
+            found.append((lane, [] if way is None else self._inner(way)))
+        return found
+
+    def _open_lanes(self, route: Sequence[str]) -> list[dict[str, "_Ahead"]]:
+        """Return what is ahead of each lane that is open to an ego, by its id, for each edge of a route."""
+        found: list[dict[str, _Ahead]] = [{}]
+        for edge in reversed(route):
+            after = found[0]
+            lanes = (lane for lane in self.net.getEdge(edge).getLanes() if lane.allows(EGO_CLASS))
+            found.insert(0, {lane.getID(): _ahead(lane, after) for lane in lanes})
+        return found[:-1]
 
     def edge_starts_m(self, route: Sequence[str]) -> tuple[float, ...]:
         """Return where each edge of a route begins along it."""

@@ -15,6 +15,7 @@ from tint_sumo.scenes.registry import (
     find_scenes,
     paper_scene,
     require_built_in,
+    require_trait_steps,
 )
 from tint_sumo.scenes.scene import EgoTask, Route, Scene, View
 from tint_sumo.scenes.settings import described, read_described, read_scene, scene_settings
@@ -39,5 +40,6 @@ __all__ = [
     "read_described",
     "read_scene",
     "require_built_in",
+    "require_trait_steps",
     "scene_settings",
 ]

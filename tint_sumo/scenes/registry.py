@@ -1,10 +1,12 @@
 """The built-in scenes by their names."""
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import overload
 
+from tint_sumo.config import STEP_S
 from tint_sumo.core.errors import InputError, find_named
 from tint_sumo.scenes.scene import Scene
 from tint_sumo.scenes.sumocfg import SumocfgScene
@@ -68,6 +70,15 @@ def require_built_in(work: str, scene: AnyScene) -> Scene:
     if not isinstance(scene, Scene):
         raise InputError(f"{work} needs a built-in scene, or one with other numbers, not a SUMO configuration")
     return scene
+
+
+def require_trait_steps(scene: AnyScene) -> None:
+    """Raise InputError unless a scene has the steps in which traits, and the speeds beside them, are inferred."""
+    if not math.isclose(scene.step_s, STEP_S):
+        raise InputError(
+            f"scene {scene.name} has steps of {scene.step_s:g} s, and traits are inferred in steps of {STEP_S:g} s; "
+            f"set its step_s, or the step-length of its .sumocfg, to {STEP_S:g}"
+        )
 
 
 def digest_of(scenes: Sequence[AnyScene]) -> str:

@@ -42,6 +42,7 @@ from tint_sumo.core.structures import (
 from tint_sumo.scenes.buildings import corner_buildings
 from tint_sumo.scenes.drivers import PopulationSetting
 from tint_sumo.scenes.registry import ALL_SCENES, SCENES, T_INTERSECTION, AnyScene, digest_of, find_scene, find_scenes
+from tint_sumo.scenes.replay import ReplayScene
 from tint_sumo.scenes.scene import Building, Scene, require_scene_name
 from tint_sumo.scenes.sumocfg import SumocfgScene, from_sumocfg
 
@@ -215,8 +216,13 @@ def scene_settings(scene: AnyScene) -> SceneSettings | SumocfgSettings:
     """Return a scene as a file describes it, in full.
 
     Raises:
-        InputError: its roads are those of no built-in scene.
+        InputError: its roads are those of no built-in scene, or it is a recording, which no file describes.
     """
+    if isinstance(scene, ReplayScene):
+        raise InputError(
+            f"scene {scene.name} is a recording, which the files of policies and datasets cannot describe; "
+            "use a built-in scene or a SUMO configuration"
+        )
     if isinstance(scene, SumocfgScene):
         return SumocfgSettings.of(scene)
     if (scene.base or scene.name) not in SCENES:
@@ -225,7 +231,11 @@ def scene_settings(scene: AnyScene) -> SceneSettings | SumocfgSettings:
 
 
 def described(scenes: Sequence[AnyScene]) -> dict[str, Any]:
-    """Return the entries that name a scene, or all scenes, in cards and settings of runs; for ``read_described``."""
+    """Return the entries that name a scene, or all scenes, in cards and settings of runs; for ``read_described``.
+
+    Raises:
+        InputError: as in ``scene_settings``.
+    """
     scene, *others = scenes
     if others:
         return {"scene": ALL_SCENES, "scene_digest": digest_of(scenes)}

@@ -6,7 +6,7 @@ learn their traits takes their vTypes for labels.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -127,9 +127,7 @@ class SumocfgScene:
 
     @property
     def ego(self) -> EgoTask:
-        """The task; the controller's gain is such that a speed is reached, and not passed, in a step of any length."""
-        controller = replace(self.controller, gain_per_s=min(self.controller.gain_per_s, 1.0 / self.step_s))
-        return EgoTask(self.ego_route, self.start_m, self.goal_m, controller=controller)
+        return EgoTask(self.ego_route, self.start_m, self.goal_m, controller=self.controller)
 
     @property
     def speed_scale_mps(self) -> float:

@@ -53,8 +53,10 @@ class EgoRules(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene | SumocfgScene) -> "EgoRules":
+        """Return the rules of a scene; the gain is at most one that reaches a speed in a single step."""
         *names, _ = cls._fields
-        return cls(**{name: getattr(scene.ego.controller, name) for name in names}, step_s=scene.step_s)
+        rules = cls(**{name: getattr(scene.ego.controller, name) for name in names}, step_s=scene.step_s)
+        return rules._replace(gain_per_s=min(rules.gain_per_s, 1.0 / rules.step_s))
 
 
 class Egos:

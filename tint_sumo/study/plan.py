@@ -9,7 +9,16 @@ from tint_sumo.dataset.recorder import record
 from tint_sumo.jobs import Job, Workers, executor_of
 from tint_sumo.methods.loading import shipped_policies
 from tint_sumo.methods.registry import Learned, Rule, find_learned, find_method, with_shared_trainings
-from tint_sumo.scenes import T_INTERSECTION, AnyScene, Scene, described, find_scene, paper_scene, require_built_in
+from tint_sumo.scenes import (
+    T_INTERSECTION,
+    AnyScene,
+    Scene,
+    described,
+    find_scene,
+    paper_scene,
+    require_built_in,
+    require_trait_steps,
+)
 from tint_sumo.scenes.drivers import require_two_kinds
 from tint_sumo.study.budgets import Budget
 from tint_sumo.study.ceiling_job import CeilingJob
@@ -98,9 +107,10 @@ def require_scene(work: str, scene: AnyScene) -> Scene:
 
 
 def _require_traits(budget: Budget, scene: Scene) -> None:
-    """Raise InputError unless the study has trait models for the scene."""
+    """Raise InputError unless the study has trait models for the scene, and the scene the steps that they read."""
     if budget.traits is None and scene.digest != paper_scene().digest:
         raise InputError(
             f"the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; give the budget traits, and "
             "windows to learn them from, as the budget quick has"
         )
+    require_trait_steps(scene)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tint_sumo.core.ranges import Range
 from tint_sumo.dataset.windows import Windows, cut_windows, window_rows
 from tint_sumo.envs import SceneVectorEnv, TaskSettings
+from tint_sumo.scenes import require_trait_steps
 
 _WAIT = 0  # action
 _STEPS = Range(1, 10_000_000)
@@ -91,9 +92,11 @@ def perceive(tasks: Sequence[TaskSettings], steps: int, num_envs: int, seed: int
         drive: the egos' actions.
 
     Raises:
-        InputError: the number of steps makes no sense.
+        InputError: the number of steps makes no sense, or a scene's steps are not those that traits are inferred in.
     """
     _STEPS.require("steps", steps)
+    for task in tasks:
+        require_trait_steps(task.scene)
     settings = [replace(task, tracks=True, decision_s=None) for task in tasks]
     env = SceneVectorEnv(num_envs, settings, None, None, AutoresetMode.SAME_STEP)
     seen: dict[str, list[NDArray[Any]]] = {key: [] for key in ("track", "position_m", "gap_m", "traits")}
@@ -134,7 +137,7 @@ def perceived_windows(
         seed: of the first environment; the others have those that follow.
 
     Raises:
-        InputError: the number of steps makes no sense.
+        InputError: as in ``perceive``.
     """
     seen = perceive([task], steps, num_envs, seed)
     when, at_env, slot = np.nonzero(seen.present)

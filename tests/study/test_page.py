@@ -120,6 +120,15 @@ def moment(vehicles: list[int], x_m: float, outcome: str = "", **changes: Any) -
     return replace(common, **changes)
 
 
+def test_a_trait_that_changes_is_shown_as_it_is_at_each_moment() -> None:
+    moments = tuple(moment([7, 2], x_m, traits=np.array([trait, 1])) for x_m, trait in ((0.0, 0), (1.0, 1), (2.0, 0)))
+    episode = encode(Driven(Case("timeout", 0.2), moments), None, ["lower", "upper"])
+    constant, changing = episode["vehicles"]
+    assert (changing["number"], changing["trait"]) == (7, 0)
+    assert decoded("trait_now", changing["trait_now"]) == [0.0, 1.0, 0.0]
+    assert (constant["trait"], "trait_now" in constant) == (1, False)
+
+
 def test_an_episode_survives_its_small_numbers() -> None:
     moments = (
         moment([7, -1], -3.14, desired_mps=None, value=None),

@@ -33,7 +33,7 @@ from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.jobs import label, policy_folder, policy_path
 
 EPISODES = "episodes"  # folder of the recorded episodes in a study's folder
-FORMAT = 3  # number of the files' format
+FORMAT = 4  # number of the files' format
 MISSING = -32768  # a column's number where a value is missing
 # Units that the numbers of each column are multiples of. A column holds the first number, then the differences.
 UNITS = {
@@ -51,6 +51,7 @@ UNITS = {
     "seen": 1.0,
     "town_rank": 0.01,
     "town_differs": 0.01,
+    "trait_now": 1.0,
 }
 
 Column = list[int]
@@ -82,6 +83,7 @@ class _StoredVehicle:
     attention: tuple[int, ...] | None = None
     p_conservative: tuple[int, ...] | None = None
     seen: tuple[int, ...] | None = None  # whether the ego perceives it; None where it always does
+    trait_now: tuple[int, ...] | None = None  # the trait where it changes; else ``trait`` is that of all frames
 
 
 @dataclass(frozen=True)
@@ -302,13 +304,16 @@ def _vehicle(
     seen = [bool(moment.seen[slot]) for moment in present]
     if not all(seen):
         columns["seen"] = seen
+    traits = [int(moment.traits[slot]) for moment in present]
+    if len(set(traits)) > 1:
+        columns["trait_now"] = traits
     if reader is not None:
         columns["p_conservative"] = reader.p_conservative(
             np.array([moment.observed_traits[slot] for moment in present if moment.observed_traits is not None])
         )
     return {
         "number": int(number),
-        "trait": int(present[0].traits[slot]),
+        "trait": traits[0],
         "first": int(frames[0]),
         **{name: _column(name, values) for name, values in columns.items()},
     }

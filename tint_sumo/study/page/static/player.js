@@ -17,10 +17,11 @@ class Episode {
     this.routes = Object.entries(content.routes).map(([name, columns]) => [name, decode(columns).claimed]);
     this.vehicles = content.vehicles.map(({ number, trait, first, ...columns }) => ({
       number,
-      trait: traits[trait],
+      kind: trait,
       first,
       columns: decode(columns),
     }));
+    this.traits = traits;
   }
 
   // What there is to see at a frame; after the end, what there was at the end.
@@ -34,7 +35,11 @@ class Episode {
       claims: this.routes.filter(([, claimed]) => claimed[now]).map(([name]) => name),
       vehicles: this.vehicles
         .filter((one) => now >= one.first && now < one.first + one.columns.x_m.length)
-        .map((one) => ({ number: one.number, trait: one.trait, ...nothing, ...pick(one.columns, now - one.first) })),
+        .map((one) => {
+          const columns = pick(one.columns, now - one.first);
+          const kind = columns.trait_now ?? one.kind;
+          return { number: one.number, kind, trait: this.traits[kind], ...nothing, ...columns };
+        }),
       outcome: now === this.frames - 1 ? this.outcome : "",
     };
   }

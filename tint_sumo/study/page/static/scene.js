@@ -36,7 +36,7 @@ class SceneView {
   }
 
   driver(one) {
-    const box = this.box(one, one.trait, one.trait[0].toUpperCase());
+    const box = this.box(one, `driver trait${one.kind}`, one.kind ? "A" : "C");
     box.querySelector(".body").style.fill = inferredColour(one.p_conservative);
     box.classList.toggle("hatched", one.p_conservative !== null && one.p_conservative < 0.5);
     box.classList.toggle("hidden", !one.seen);

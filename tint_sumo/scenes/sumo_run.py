@@ -62,19 +62,20 @@ class SumocfgRun:
             self._values[_ADDITIONAL] = ",".join(files)
 
     def options(
-        self, seed: int | Sequence[int], step_s: float | None = None, more: Mapping[str, str] | None = None
+        self, seed: int | Sequence[int], step_s: float | None = None, more: Mapping[str, str | None] | None = None
     ) -> list[str]:
         """Return the options of a run.
 
         Args:
             seed: of SUMO's random numbers.
             step_s: step length; the configuration's if not given.
-            more: further options, without their dashes.
+            more: further options, without their dashes; None leaves one of the configuration out.
         """
         draws = np.random.SeedSequence(seed).generate_state(1)
         values = self._values | {"seed": str(int(draws[0]) % 2**_SEED_BITS)}
         values |= {} if step_s is None else {"step-length": str(step_s)}
-        return list(chain.from_iterable((f"--{name}", value) for name, value in (values | dict(more or {})).items()))
+        given = {name: value for name, value in (values | dict(more or {})).items() if value is not None}
+        return list(chain.from_iterable((f"--{name}", value) for name, value in given.items()))
 
 
 def require_loads(config: SumoConfig) -> None:

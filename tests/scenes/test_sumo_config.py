@@ -12,6 +12,7 @@ from tests.scenes.networks import UserNetwork, write_config
 from tint_sumo.config import MOST_LABELS
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.sumo_config import base_vtype, read_config, read_vtypes
+from tint_sumo.scenes.sumo_run import require_loads
 
 Make = Callable[[str], UserNetwork]
 ROUTES = '<routes>{}<vehicle id="one" depart="0" type="car"><route edges="in out"/></vehicle></routes>'
@@ -63,6 +64,23 @@ def test_folders_may_have_any_name(name: str, folder: Path) -> None:
     net_file = config.values(scratch)["net-file"]
     assert "," not in net_file
     assert Path(net_file).samefile(other / "merge.net.xml")
+
+
+@pytest.mark.parametrize("second", [" b.add.xml", "\n        b.add.xml ", " ../merge/b.add.xml", " {folder}/b.add.xml"])
+def test_blanks_and_line_breaks_may_part_the_files_of_a_list(second: str, folder: Path) -> None:
+    for name in ("a", "b"):
+        (folder / f"{name}.add.xml").write_text(f'<additional><vType id="{name}"/></additional>')
+    more = f'<additional-files value=" a.add.xml ,{second.format(folder=folder)}"/>'
+    config = read_config(write_config(folder / "l.sumocfg", " merge.net.xml ", "merge.rou.xml", more))
+    assert [file.name for file in config.files] == [
+        "l.sumocfg",
+        "merge.net.xml",
+        "a.add.xml",
+        "b.add.xml",
+        "merge.rou.xml",
+    ]
+    assert read_vtypes(config) == ("a", "b", "calm", "hasty")
+    require_loads(config)
 
 
 def test_paths_begin_where_a_link_to_the_configuration_is(folder: Path, tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ def _ask_sumo(file: Path) -> list[tuple[str, str, str]]:
             reason = first_reason(result.stderr.replace(str(there), here))
             raise refused(f"does not read {file} ({reason})", file) from None
         return [
-            (section.tag, option.tag, _VARIABLE.sub(_value_of, option.get("value", "")).replace(str(there), here))
+            (section.tag, option.tag, _resolved(option.get("value", ""), str(there)).replace(str(there), here))
             for section in root
             for option in section
         ]
@@ -178,6 +178,15 @@ def first_reason(printed: str) -> str:
     _, _, rest = printed.partition("Error: ")
     first, _, _ = re.sub(r"\n(Error|Warning): |\nQuitting", "\0", rest).partition("\0")
     return " ".join(first.split())
+
+
+def _resolved(value: str, folder: str) -> str:
+    """Return an option's value with environment variables put in, and without blanks before the paths of a list.
+
+    SUMO reads over such blanks, but writes the configuration's folder before them, even where the path is absolute.
+    """
+    value = _VARIABLE.sub(_value_of, value)
+    return re.sub(rf"{re.escape(folder)}/\s+(/?)", lambda blanks: blanks[1] or f"{folder}/", value)
 
 
 def _value_of(variable: re.Match[str]) -> str:

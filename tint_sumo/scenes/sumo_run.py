@@ -90,8 +90,14 @@ def require_loads(config: SumoConfig) -> None:
 @lru_cache(maxsize=64)
 def _require_loads(config: SumoConfig, _digest: str) -> None:
     with closing(SumocfgRun(config)) as run:
-        command = [sys.executable, "-c", _LOAD, *run.options(seed=0)]
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-    if result.returncode != 0:
-        reason = first_reason(result.stderr) or f"it ends with code {result.returncode}"
+        reason = why_not_loaded(run.options(seed=0))
+    if reason:
         raise refused(f"does not run {config.file} ({reason})", config.file)
+
+
+def why_not_loaded(options: Sequence[str]) -> str:
+    """Let SUMO load a run's input in a process of its own; return why it does not, "" if it does."""
+    result = subprocess.run([sys.executable, "-c", _LOAD, *options], capture_output=True, text=True, check=False)
+    if result.returncode == 0:
+        return ""
+    return first_reason(result.stderr) or f"it ends with code {result.returncode}"

@@ -149,10 +149,24 @@ def test_options_about_output_messages_and_windows_are_left_out(folder: Path) ->
     assert {"tripinfo-output", "netstate-dump", "log", "remote-port", "start"} <= set(config.left_out)
 
 
-def test_mesoscopic_configurations_are_refused(folder: Path) -> None:
-    config = write_config(folder / "m.sumocfg", "merge.net.xml", "merge.rou.xml", '<mesosim value="1"/>')
-    with pytest.raises(InputError, match=r"m\.sumocfg is mesoscopic"):
-        read_config(config)
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("mesosim", r"is mesoscopic, .*; leave mesosim out"),
+        ("no-internal-links", r"lets vehicles jump over junctions, .*; leave no-internal-links out"),
+    ],
+)
+def test_configurations_in_which_drivers_have_no_positions_everywhere_are_refused(
+    option: str, message: str, folder: Path
+) -> None:
+    def config(value: str) -> Path:
+        return write_config(folder / "m.sumocfg", "merge.net.xml", "merge.rou.xml", f'<{option} value="{value}"/>')
+
+    for on in ("1", "true", "Yes"):
+        with pytest.raises(InputError, match=message):
+            read_config(config(on))
+    for off in ("0", "False", "off"):
+        assert dict(read_config(config(off)).options)[option] == off
 
 
 def test_what_sumo_says_of_a_configuration_that_it_refuses_is_one_line(folder: Path) -> None:

@@ -34,6 +34,11 @@ _INPUTS = (_NET, *_DEMAND, "weight-files", "data-files")  # options that name fi
 # Sections of options about files that SUMO writes, messages, remote control and windows: a run has its own. But
 # whether files are validated decides which ones SUMO reads.
 _LEFT_OUT, _KEPT = {"output", "report", "traci_server", "gui_only"}, "xml-validation"
+_REFUSED = {
+    "mesosim": "is mesoscopic, and drivers have no positions then",
+    "no-internal-links": "lets vehicles jump over junctions, and nobody meets there",
+}
+_OFF = ("0", "no", "false", "off", "-", "f")  # as SUMO reads it, in capital letters, too
 # Options that would keep SUMO from saying how it reads a configuration.
 _ONLY_READ = (
     *("--help", "false"),
@@ -127,14 +132,16 @@ def read_config(file: Path) -> SumoConfig:
     """Return a SUMO configuration as SUMO reads it.
 
     Raises:
-        InputError: there is none, SUMO refuses it, it is mesoscopic, or files that it names are missing.
+        InputError: there is none, SUMO refuses it, files that it names are missing, or it is mesoscopic or without
+            lanes on junctions.
     """
     file = file.absolute()  # not resolved: SUMO takes paths from where a link is
     require_file(file, "SUMO configuration", TABLE_BYTES)
     found = _ask_sumo(file)
     options = {name: value for section, name, value in found if _is_kept(section, name)}
-    if options.get("mesosim", "false") != "false":
-        raise InputError(f"{file} is mesoscopic, and drivers have no positions then; leave mesosim out")
+    for name, reason in _REFUSED.items():
+        if options.get(name, "false").lower() not in _OFF:
+            raise InputError(f"{file} {reason}; leave {name} out")
     left_out = {name for _, name, _ in found} - options.keys() - {flag.removeprefix("--") for flag in _ONLY_READ}
     config = SumoConfig(file, tuple(options.items()), tuple(sorted(left_out)))
     if len(config._named(_NET)) != 1:

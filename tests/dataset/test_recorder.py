@@ -194,6 +194,10 @@ def test_recording_again_leaves_a_finished_dataset_alone(dataset: Path) -> None:
         ({"windows": 10, "workers": 0}, "workers must lie in 1 to 1,024"),
         ({"windows": 10, "seed": -1}, "seed must not be negative"),
         ({"windows": 10, "scene": "moon"}, "unknown scene 'moon'"),
+        (
+            {"windows": 10, "scene": replace(T, step_s=0.5)},
+            r"steps of 0\.1 s, but the scene t_intersection has step_s: 0\.5",
+        ),
     ],
 )
 def test_bad_arguments_write_nothing(tmp_path: Path, arguments: dict[str, Any], message: str) -> None:

@@ -120,6 +120,24 @@ def test_a_vehicle_that_sumo_teleports_appears_anew(user_network: Make, tmp_path
     assert first.groupby("vehicle")["position_m"].diff().max() < 2.0
 
 
+def test_a_vehicle_is_not_recorded_while_it_parks_beside_the_road(user_network: Make, tmp_path: Path) -> None:
+    net = str(user_network("merge").sumocfg.with_name("merge.net.xml"))
+    (tmp_path / "park.rou.xml").write_text(
+        '<routes><vehicle id="parks" depart="0"><route edges="ramp out"/>'
+        '<stop lane="ramp_0" endPos="50" duration="20" parking="true"/></vehicle>'
+        '<vehicle id="passes" depart="12"><route edges="ramp out"/></vehicle></routes>'
+    )
+    record_sumocfg(write_config(tmp_path / "park.sumocfg", net, "park.rou.xml"), tmp_path / "d", 10, progress=False)
+    rows = pd.read_parquet(tmp_path / "d" / TRAJECTORIES)
+    before, passes, after = (rows[(rows["episode"] == 0) & (rows["vehicle"] == number)] for number in range(3))
+    assert before["time_s"].max() + 20.0 == pytest.approx(after["time_s"].min(), abs=0.2)
+    assert before["position_m"].max() == pytest.approx(after["position_m"].min(), abs=0.2)
+    assert passes["position_m"].iloc[-1] > 100.0
+    alone = passes["time_s"] < after["time_s"].min()
+    assert alone.any()
+    assert passes["leader"][alone].isna().all()
+
+
 def test_a_folder_is_of_one_configuration_and_seed(merge_data: Path, user_network: Make, tmp_path: Path) -> None:
     network = user_network("merge")
     with pytest.raises(InputError, match="different: seed"):

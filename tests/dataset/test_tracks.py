@@ -80,7 +80,7 @@ def test_with_the_network_leaders_are_seen_across_lanes(
     assert np.isnan(gaps(tracks(tmp_path, {0.0: seen, 0.1: seen}), "a")).all()
 
 
-def test_each_leader_has_the_length_of_its_vtype(tmp_path: Path) -> None:
+def test_each_leader_has_the_length_of_its_vtype(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """A bus without a length has that of its vClass, which SUMO knows; a type of one vehicle is that of all."""
     (tmp_path / "vtypes.add.xml").write_text(
         '<additional><vTypeDistribution id="mix"><vType id="short.1" length="3.5" probability="1"/>'
@@ -95,8 +95,9 @@ def test_each_leader_has_the_length_of_its_vtype(tmp_path: Path) -> None:
     rows = read_tracks(tmp_path / "fcd.xml", vtypes_file=tmp_path / "vtypes.add.xml")
     assert [gaps(rows, vehicle)[0] for vehicle in "abc"] == [8.0, 16.5, 8.0]
     (tmp_path / "vtypes.add.xml").write_text('<additional><vType id="bus" length="-1"/></additional>')
-    with pytest.raises(InputError, match=r"SUMO refuses a vType of .*vtypes\.add\.xml"):
+    with pytest.raises(InputError, match=r"SUMO refuses a vType of .*vtypes\.add\.xml \(length must be greater than 0"):
         read_tracks(tmp_path / "fcd.xml", vtypes_file=tmp_path / "vtypes.add.xml")
+    assert capfd.readouterr().err == ""  # SUMO prints nothing beside it
     (tmp_path / "vtypes.add.xml").write_text('<additional><vType id="bus"/></additional>')
     with pytest.raises(InputError, match=r"vtypes\.add\.xml has no vType 'short.1'"):
         read_tracks(tmp_path / "fcd.xml", vtypes_file=tmp_path / "vtypes.add.xml")

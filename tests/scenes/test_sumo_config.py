@@ -12,6 +12,7 @@ from tests.scenes.networks import UserNetwork, write_config
 from tint_sumo.config import MOST_LABELS
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes.sumo_config import base_vtype, read_config, read_vtypes
+from tint_sumo.scenes.sumo_run import require_loads
 
 Make = Callable[[str], UserNetwork]
 ROUTES = '<routes>{}<vehicle id="one" depart="0" type="car"><route edges="in out"/></vehicle></routes>'
@@ -63,6 +64,23 @@ def test_folders_may_have_any_name(name: str, folder: Path) -> None:
     net_file = config.values(scratch)["net-file"]
     assert "," not in net_file
     assert Path(net_file).samefile(other / "merge.net.xml")
+
+
+@pytest.mark.parametrize("second", [" b.add.xml", "\n        b.add.xml ", " ../merge/b.add.xml", " {folder}/b.add.xml"])
+def test_blanks_and_line_breaks_may_part_the_files_of_a_list(second: str, folder: Path) -> None:
+    for name in ("a", "b"):
+        (folder / f"{name}.add.xml").write_text(f'<additional><vType id="{name}"/></additional>')
+    more = f'<additional-files value=" a.add.xml ,{second.format(folder=folder)}"/>'
+    config = read_config(write_config(folder / "l.sumocfg", " merge.net.xml ", "merge.rou.xml", more))
+    assert [file.name for file in config.files] == [
+        "l.sumocfg",
+        "merge.net.xml",
+        "a.add.xml",
+        "b.add.xml",
+        "merge.rou.xml",
+    ]
+    assert read_vtypes(config) == ("a", "b", "calm", "hasty")
+    require_loads(config)
 
 
 def test_paths_begin_where_a_link_to_the_configuration_is(folder: Path, tmp_path: Path) -> None:
@@ -131,10 +149,24 @@ def test_options_about_output_messages_and_windows_are_left_out(folder: Path) ->
     assert {"tripinfo-output", "netstate-dump", "log", "remote-port", "start"} <= set(config.left_out)
 
 
-def test_mesoscopic_configurations_are_refused(folder: Path) -> None:
-    config = write_config(folder / "m.sumocfg", "merge.net.xml", "merge.rou.xml", '<mesosim value="1"/>')
-    with pytest.raises(InputError, match=r"m\.sumocfg is mesoscopic"):
-        read_config(config)
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("mesosim", r"is mesoscopic, .*; leave mesosim out"),
+        ("no-internal-links", r"lets vehicles jump over junctions, .*; leave no-internal-links out"),
+    ],
+)
+def test_configurations_in_which_drivers_have_no_positions_everywhere_are_refused(
+    option: str, message: str, folder: Path
+) -> None:
+    def config(value: str) -> Path:
+        return write_config(folder / "m.sumocfg", "merge.net.xml", "merge.rou.xml", f'<{option} value="{value}"/>')
+
+    for on in ("1", "true", "Yes"):
+        with pytest.raises(InputError, match=message):
+            read_config(config(on))
+    for off in ("0", "False", "off"):
+        assert dict(read_config(config(off)).options)[option] == off
 
 
 def test_what_sumo_says_of_a_configuration_that_it_refuses_is_one_line(folder: Path) -> None:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from tests.scenes.networks import USER_NETWORKS, UserNetwork, write_config
 from tint_sumo.config import Backend, EgoController
 from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SumocfgScene
+from tint_sumo.scenes.sumocfg import measure_route, read_net
 from tint_sumo.simulation import SumocfgSimulation, make_simulation
 from tint_sumo.simulation.ego_way import EGO
 
@@ -338,6 +340,27 @@ def test_an_ego_that_a_calibrator_removes_is_lost(user_network: Make) -> None:
             if simulation.egos.lost[0]:
                 break
         assert simulation.egos.lost[0]
+
+
+@pytest.mark.parametrize("start_m", [25.0, 25.5, 26.0])
+@pytest.mark.parametrize("ballistic", [False, True])
+def test_an_ego_that_brakes_at_its_routes_end_arrives_however_sumo_moves_it(
+    ballistic: bool, start_m: float, user_network: Make, tmp_path: Path
+) -> None:
+    net = user_network("merge").sumocfg.with_name("merge.net.xml")
+    (tmp_path / "empty.rou.xml").write_text("<routes/>")
+    method = f'<step-length value="1"/><step-method.ballistic value="{ballistic}"/>'
+    sumocfg = write_config(tmp_path / "method.sumocfg", str(net), "empty.rou.xml", method)
+    *_, end_m = measure_route(read_net(net), ("ramp", "out"))
+    network = UserNetwork(sumocfg, ("ramp", "out"), start_m, end_m - 0.01, (0.0, 5.0, 10.0))
+    with begun(network.scene(warm_up_s=1.0)) as simulation:
+        egos = simulation.egos
+        for _ in drive(simulation, 60):
+            if egos.front_m[0] > end_m - 10.0:
+                break
+        for _ in drive(simulation, 2, desired_mps=0.0):
+            assert not egos.lost[0]
+        assert egos.front_m[0] > network.goal_m
 
 
 _ROUTERS = {

@@ -16,6 +16,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SumocfgScene
 from tint_sumo.scenes.network import sumo_program
 from tint_sumo.simulation import SumocfgSimulation
+from tint_sumo.simulation.warm_starts import _LOADING
 
 Make = Callable[[str], UserNetwork]
 
@@ -41,6 +42,13 @@ DRIVERS_TO_COME = """<routes>
     <personFlow id="driver" begin="0" end="900" period="8">
         <personTrip from="left1A1" to="B0B1" modes="car"/>
     </personFlow>
+</routes>
+"""
+TIMETABLE = """<routes>
+    <vType id="exact" sigma="0" speedDev="0"/>
+    <flow id="through" type="exact" from="in" to="out" begin="0" end="900" period="5"/>
+    <vehicle id="passed" type="exact" depart="20"><route edges="in out"/></vehicle>
+    <vehicle id="late" type="exact" depart="55"><route edges="in out"/></vehicle>
 </routes>
 """
 MIXED_MORE = """<additional>
@@ -184,6 +192,48 @@ def test_options_of_the_user_for_states_do_not_change_them(user_network: Make, t
         expected = [lived(simulation, seed) for seed in range(2)]
     with simulating(other.scene(warm_starts=2)) as simulation:
         assert [lived(simulation, seed) for seed in range(2)] == expected
+
+
+def timetable(network: UserNetwork, folder: Path, begin: str) -> SumocfgScene:
+    """Traffic without random numbers, which begins when its configuration says."""
+    routes = folder / "timetable.rou.xml"
+    routes.write_text(TIMETABLE)
+    more = f'<step-length value="0.5"/>{begin}'
+    sumocfg = write_config(
+        folder / "timetable.sumocfg", str(network.sumocfg.parent / "merge.net.xml"), str(routes), more
+    )
+    return replace(network, sumocfg=sumocfg).scene(warm_up_s=20.0)
+
+
+@pytest.mark.parametrize(
+    ("begin", "begin_s"), [("", 0.0), ('<begin value="0"/>', 0.0), ('<begin value="0:0:30"/>', 30.0)]
+)
+@pytest.mark.parametrize("backend", ["libsumo", "traci"])
+def test_a_warm_start_goes_on_like_the_warm_up_whenever_the_traffic_begins(
+    begin: str, begin_s: float, backend: Backend, user_network: Make, tmp_path: Path
+) -> None:
+    scene = timetable(user_network("merge"), tmp_path, begin)
+    with simulating(scene, backend) as simulation:
+        expected = lived(simulation, 1, steps=100)
+    with simulating(replace(scene, warm_starts=1), backend) as simulation:
+        simulation.reset(0, 1)
+        assert simulation.connection.simulation.getTime() == begin_s + 20.0 + scene.step_s  # in which the ego enters
+        assert lived(simulation, 1, steps=100) == expected
+        assert None not in simulation.warm_starts.states.values()
+    assert any("late" in positions for positions in expected)
+    assert any("passed" in positions for positions in expected) == (begin_s == 0.0)
+
+
+def test_a_state_that_sumo_loads_at_another_time_is_not_used(
+    user_network: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = timetable(user_network("merge"), tmp_path, "")
+    with simulating(scene) as simulation:
+        usual = lived(simulation, 1)
+    monkeypatch.setitem(_LOADING, "begin", "3")
+    with simulating(replace(scene, warm_starts=1)) as simulation:
+        assert lived(simulation, 1) == usual
+        assert simulation.warm_starts.states == {0: None}
 
 
 def test_a_state_that_sumo_refuses_is_an_error_with_a_way_out(user_network: Make) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from tint_sumo.config import AnyMix, Mix, Population
+from tint_sumo.config import STEP_S, AnyMix, Mix, Population
+from tint_sumo.core.errors import InputError
 from tint_sumo.core.structures import plain
 from tint_sumo.dataset.schema import SCHEMA_VERSION, Manifest
 from tint_sumo.dataset.shards import EPISODE_STEPS, record_dataset, require_sizes
@@ -34,10 +35,15 @@ class Recording:
     scene: Scene = field(default_factory=paper_scene)
 
     episodes_per_shard: ClassVar[int] = EPISODES_PER_SHARD
+    episode_s: ClassVar[float] = EPISODE_STEPS * STEP_S
 
     def __post_init__(self) -> None:
         require_sizes(self.windows, self.seed)
-        self.played()
+        if self.played().step_s != STEP_S:
+            raise InputError(
+                f"windows consist of steps of {STEP_S:g} s, but the scene {self.scene.name} has step_s: "
+                f"{self.scene.step_s:g}; leave it out"
+            )
 
     def played(self) -> Scene:
         scene = self.scene
@@ -55,10 +61,6 @@ class Recording:
             "population": population_name(played.population) or plain(played.population),
             "seed": self.seed,
         }
-
-    @property
-    def episode_s(self) -> float:
-        return EPISODE_STEPS * self.played().step_s
 
     def simulate(self, shard: int) -> tuple[pd.DataFrame, pd.DataFrame]:
         with _kept_simulation(self.played()) as simulation:

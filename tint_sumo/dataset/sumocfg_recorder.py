@@ -115,7 +115,7 @@ def _simulate_episode(recording: SumocfgRecording, episode: int) -> tuple[pd.Dat
 class _Watch:
     """Rows and drivers of a running simulation; vehicles are numbered in order of appearance.
 
-    One that SUMO takes off the road and puts back elsewhere appears anew.
+    One that SUMO takes off the road and puts back elsewhere appears anew, and so does one that has parked beside it.
     """
 
     def __init__(self, config: SumoConfig, vtypes: tuple[str, ...], connection: Connection) -> None:
@@ -132,6 +132,8 @@ class _Watch:
             self._numbers.pop(vehicle_id, None)
         numbers = {}
         for vehicle_id in vehicle.getIDList():
+            if vehicle.isStoppedParking(vehicle_id):
+                continue
             known = self._numbers.get(vehicle_id)
             numbers[vehicle_id] = self._meet(vehicle_id) if known is None else known
         self._numbers = numbers

@@ -34,6 +34,11 @@ _INPUTS = (_NET, *_DEMAND, "weight-files", "data-files")  # options that name fi
 # Sections of options about files that SUMO writes, messages, remote control and windows: a run has its own. But
 # whether files are validated decides which ones SUMO reads.
 _LEFT_OUT, _KEPT = {"output", "report", "traci_server", "gui_only"}, "xml-validation"
+_REFUSED = {
+    "mesosim": "is mesoscopic, and drivers have no positions then",
+    "no-internal-links": "lets vehicles jump over junctions, and nobody meets there",
+}
+_OFF = ("0", "no", "false", "off", "-", "f")  # as SUMO reads it, in capital letters, too
 # Options that would keep SUMO from saying how it reads a configuration.
 _ONLY_READ = (
     *("--help", "false"),
@@ -127,14 +132,16 @@ def read_config(file: Path) -> SumoConfig:
     """Return a SUMO configuration as SUMO reads it.
 
     Raises:
-        InputError: there is none, SUMO refuses it, it is mesoscopic, or files that it names are missing.
+        InputError: there is none, SUMO refuses it, files that it names are missing, or it is mesoscopic or without
+            lanes on junctions.
     """
     file = file.absolute()  # not resolved: SUMO takes paths from where a link is
     require_file(file, "SUMO configuration", TABLE_BYTES)
     found = _ask_sumo(file)
     options = {name: value for section, name, value in found if _is_kept(section, name)}
-    if options.get("mesosim", "false") != "false":
-        raise InputError(f"{file} is mesoscopic, and drivers have no positions then; leave mesosim out")
+    for name, reason in _REFUSED.items():
+        if options.get(name, "false").lower() not in _OFF:
+            raise InputError(f"{file} {reason}; leave {name} out")
     left_out = {name for _, name, _ in found} - options.keys() - {flag.removeprefix("--") for flag in _ONLY_READ}
     config = SumoConfig(file, tuple(options.items()), tuple(sorted(left_out)))
     if len(config._named(_NET)) != 1:
@@ -162,7 +169,7 @@ def _ask_sumo(file: Path) -> list[tuple[str, str, str]]:
             reason = first_reason(result.stderr.replace(str(there), here))
             raise refused(f"does not read {file} ({reason})", file) from None
         return [
-            (section.tag, option.tag, _VARIABLE.sub(_value_of, option.get("value", "")).replace(str(there), here))
+            (section.tag, option.tag, _resolved(option.get("value", ""), str(there)).replace(str(there), here))
             for section in root
             for option in section
         ]
@@ -178,6 +185,15 @@ def first_reason(printed: str) -> str:
     _, _, rest = printed.partition("Error: ")
     first, _, _ = re.sub(r"\n(Error|Warning): |\nQuitting", "\0", rest).partition("\0")
     return " ".join(first.split())
+
+
+def _resolved(value: str, folder: str) -> str:
+    """Return an option's value with environment variables put in, and without blanks before the paths of a list.
+
+    SUMO reads over such blanks, but writes the configuration's folder before them, even where the path is absolute.
+    """
+    value = _VARIABLE.sub(_value_of, value)
+    return re.sub(rf"{re.escape(folder)}/\s+(/?)", lambda blanks: blanks[1] or f"{folder}/", value)
 
 
 def _value_of(variable: re.Match[str]) -> str:

@@ -62,19 +62,20 @@ class SumocfgRun:
             self._values[_ADDITIONAL] = ",".join(files)
 
     def options(
-        self, seed: int | Sequence[int], step_s: float | None = None, more: Mapping[str, str] | None = None
+        self, seed: int | Sequence[int], step_s: float | None = None, more: Mapping[str, str | None] | None = None
     ) -> list[str]:
         """Return the options of a run.
 
         Args:
             seed: of SUMO's random numbers.
             step_s: step length; the configuration's if not given.
-            more: further options, without their dashes.
+            more: further options, without their dashes; None leaves one of the configuration out.
         """
         draws = np.random.SeedSequence(seed).generate_state(1)
         values = self._values | {"seed": str(int(draws[0]) % 2**_SEED_BITS)}
         values |= {} if step_s is None else {"step-length": str(step_s)}
-        return list(chain.from_iterable((f"--{name}", value) for name, value in (values | dict(more or {})).items()))
+        given = {name: value for name, value in (values | dict(more or {})).items() if value is not None}
+        return list(chain.from_iterable((f"--{name}", value) for name, value in given.items()))
 
 
 def require_loads(config: SumoConfig) -> None:
@@ -89,8 +90,14 @@ def require_loads(config: SumoConfig) -> None:
 @lru_cache(maxsize=64)
 def _require_loads(config: SumoConfig, _digest: str) -> None:
     with closing(SumocfgRun(config)) as run:
-        command = [sys.executable, "-c", _LOAD, *run.options(seed=0)]
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-    if result.returncode != 0:
-        reason = first_reason(result.stderr) or f"it ends with code {result.returncode}"
+        reason = why_not_loaded(run.options(seed=0))
+    if reason:
         raise refused(f"does not run {config.file} ({reason})", config.file)
+
+
+def why_not_loaded(options: Sequence[str]) -> str:
+    """Let SUMO load a run's input in a process of its own; return why it does not, "" if it does."""
+    result = subprocess.run([sys.executable, "-c", _LOAD, *options], capture_output=True, text=True, check=False)
+    if result.returncode == 0:
+        return ""
+    return first_reason(result.stderr) or f"it ends with code {result.returncode}"

@@ -55,7 +55,7 @@ class EgoWay:
         self._is_on(found)
 
     def look(self, moved_m: float) -> Fate:
-        """Return the ego's state after a step of this length; put it back on its route if it was rerouted."""
+        """Return the ego's state after a step of at most this length; put it back on its route if it was rerouted."""
         found = self._connection.vehicle.getSubscriptionResults(self._ego)
         if self._ego in self._connection.simulation.getStartingTeleportIDList():
             return Fate.LOST

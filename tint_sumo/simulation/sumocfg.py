@@ -285,7 +285,7 @@ class SumocfgSimulation(Simulation):
         self._take_over(moved_m)
 
     def _take_over(self, moved_m: float) -> None:
-        """Take over from SUMO what has come of a step in which the ego has moved by so much, or at most so much."""
+        """Take over from SUMO what has come of a step in which the ego has moved by at most so much."""
         with self._running.refusals:
             fate = self._way.look(moved_m)
         if fate is Fate.DRIVES:
@@ -299,13 +299,14 @@ class SumocfgSimulation(Simulation):
         self.connection.step()
 
     def _drive(self, desired_speed_mps: Floats) -> float:
-        """Choose the ego's speed in this step, if SUMO does not; return it, or the highest that SUMO may choose."""
+        """Choose the ego's speed in this step, if SUMO does not; return the highest that it may have in the step."""
+        before_mps = float(self.egos.speed_mps[0])
         if self.scene.ego_control == "sumo":
-            return float(self.egos.speed_mps[0]) + self._accel_mps2 * self._step_s
+            return before_mps + self._accel_mps2 * self._step_s
         self.egos.drive(desired_speed_mps)
         speed_mps = float(self.egos.speed_mps[0])
         self.connection.vehicle.setSpeed(self._ego, speed_mps)
-        return speed_mps
+        return max(before_mps, speed_mps)  # step-method.ballistic moves it at their mean
 
     def _end(self, fate: Fate) -> None:
         """Leave all as it was at last: the ego has come to its route's end, or SUMO has taken it away."""

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 from tint_sumo.core.reading import TABLE_BYTES, open_file, unpacked
 from tint_sumo.scenes.ego_routes import EgoRoute, Turn, suggest_routes
 from tint_sumo.scenes.sumo_config import SumoConfig, read_config, read_vtypes
-from tint_sumo.scenes.sumo_run import SumocfgRun
+from tint_sumo.scenes.sumo_run import SumocfgRun, require_loads
 from tint_sumo.scenes.sumocfg import EGO_CLASS, SumocfgScene, read_net
 from tint_sumo.simulation.connection import connect
 from tint_sumo.simulation.refusals import Refusals
@@ -96,6 +96,7 @@ def check_sumocfg(sumocfg: Path, scene: SumocfgScene | None = None) -> Check:
     """
     config = read_config(sumocfg)
     net = read_net(config.net_file)
+    require_loads(config)
     labels = read_vtypes(config)
     known = read_vtype_table(config.file)
     vtypes = {name: vtype for name in labels if (vtype := find_vtype(name, known)) is not None}

@@ -13,8 +13,8 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
 from tint_sumo.core.reading import TABLE_BYTES, require_file
 from tint_sumo.scenes.sumo_config import base_vtype, read_config
-from tint_sumo.simulation.connection import SUMO_ERRORS, connect
-from tint_sumo.simulation.refusals import one_line
+from tint_sumo.scenes.sumo_run import why_not_loaded
+from tint_sumo.simulation.connection import connect
 
 _ATTRIBUTES = ("id", "vClass", "length", "width")  # of a vType: its size follows from them
 _MODEL, _USUAL_MODEL = "carFollowModel", "Krauss"  # SUMO does not say which model a type has
@@ -47,11 +47,14 @@ def read_vtype_table(file: Path) -> Mapping[str, VType]:
     with TemporaryDirectory(prefix="tint_sumo_") as folder:
         additional = Path(folder) / "vtypes.add.xml"
         additional.write_text(f"<additional>{''.join(elements)}</additional>", encoding="utf-8")
-        options = ["--net-file", str(shipped("sumo_net") / "tint.net.xml"), "--additional-files", str(additional)]
-        try:
-            connection = connect([*options, "--no-step-log", "true", "--no-warnings", "true"])
-        except SUMO_ERRORS as error:
-            raise InputError(f"SUMO refuses a vType of {file} ({one_line(error)}); correct it") from None
+        options = [
+            *("--net-file", str(shipped("sumo_net") / "tint.net.xml"), "--additional-files", str(additional)),
+            *("--no-step-log", "true", "--no-warnings", "true"),
+        ]
+        reason = why_not_loaded(options)
+        if reason:
+            raise InputError(f"SUMO refuses a vType of {file} ({reason}); correct it")
+        connection = connect(options)
         try:
             types = connection.vehicletype
             return {

@@ -30,9 +30,29 @@ _SAVING = {
     "save-state.constraints": "true",  # of rail signals
     "save-state.precision": "16",
 }
-_LOADING = {"load-state.offset": "0", "load-state.remove-vehicles": ""}  # the user's are for a state of the user's
+_LOADING = {
+    "load-state.offset": "0",  # the user's options are for a state of the user's
+    "load-state.remove-vehicles": "",
+    "begin": None,  # with one, SUMO's clock starts there, and not at the state's time: departures come too late
+}
 
-_Positions = dict[tuple[str, str], tuple[float, ...]]  # of all vehicles and persons, m
+
+@dataclass(frozen=True)
+class _Traffic:
+    """The vehicles and persons of a simulation."""
+
+    time_s: float
+    positions_m: dict[tuple[str, str], tuple[float, ...]]  # by kind and id
+
+    def is_same(self, other: "_Traffic") -> bool:
+        return (
+            self.time_s == other.time_s
+            and self.positions_m.keys() == other.positions_m.keys()
+            and all(
+                math.dist(position_m, other.positions_m[name]) < _SAME_M
+                for name, position_m in self.positions_m.items()
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -76,9 +96,9 @@ class WarmStarts:
         seed = (number, _STATE)
         self._warm_up(seed, self.run.options(seed, more=_SAVING))
         self.connection.simulation.saveState(file.name)  # SUMO puts it into the folder for output
-        saved = self._positions()
+        saved = self._traffic()
         self._load_state(seed, file)
-        return file if _are_same(saved, self._positions()) else None
+        return file if saved.is_same(self._traffic()) else None
 
     def _warm_up(self, seed: int | tuple[int, ...], options: list[str]) -> None:
         seeds = (seed, _TIME) if isinstance(seed, int) else (*seed, _TIME)
@@ -95,15 +115,9 @@ class WarmStarts:
                 f"({one_line(error)}); set warm_starts to 0"
             ) from None
 
-    def _positions(self) -> _Positions:
-        return {
-            (kind, name): domain.getPosition(name)
-            for kind, domain in (("vehicle", self.connection.vehicle), ("person", self.connection.person))
-            for name in domain.getIDList()
+    def _traffic(self) -> _Traffic:
+        domains = (("vehicle", self.connection.vehicle), ("person", self.connection.person))
+        positions_m = {
+            (kind, name): domain.getPosition(name) for kind, domain in domains for name in domain.getIDList()
         }
-
-
-def _are_same(saved: _Positions, loaded: _Positions) -> bool:
-    return saved.keys() == loaded.keys() and all(
-        math.dist(position_m, loaded[name]) < _SAME_M for name, position_m in saved.items()
-    )
+        return _Traffic(self.connection.simulation.getTime(), positions_m)

@@ -99,7 +99,8 @@ def worlds_lines(table: pandas.DataFrame) -> Lines:
         cells = []
         for trained_in, method in columns:
             found = table[(table["trained_in"] == trained_in) & (table["method"] == method) & (table["world"] == world)]
-            cells.append("/".join(f"{found[f'{outcome}_percent'].mean():.0f}" for outcome in BUILT_IN_OUTCOMES))
+            means = (found[f"{outcome}_percent"].mean() / 100.0 for outcome in BUILT_IN_OUTCOMES)
+            cells.append("/".join(percent(mean, 0) for mean in means))
         lines.append([f"`{world}`", *cells])
     return lines
 

@@ -485,7 +485,8 @@ def test_the_tables_of_policies_among_strangers_are_those_of_the_results() -> No
         for (method, trained_in), cell in zip(columns, cells, strict=True):
             chosen = (measured["method"] == method) & (measured["trained_in"] == trained_in)
             found = measured[chosen & (measured["world"] == world.strip("`"))]
-            assert cell == "/".join(f"{found[f'{outcome}_percent'].mean():.0f}" for outcome in BUILT_IN_OUTCOMES)
+            means = (found[f"{outcome}_percent"].mean() / 100.0 for outcome in BUILT_IN_OUTCOMES)
+            assert cell == "/".join(percent(mean, 0) for mean in means)
     trained = measured[measured["trained_in"] == "strangers"]
     for line in scores.strip().split("\n")[2:]:
         method, middle, success, collisions, careful, _ = line.strip("| ").split(" | ")

@@ -1,4 +1,7 @@
-"""The state of a policy's training between two rollouts, from which it goes on to the very end it would have had."""
+"""The state of a policy's training between two rollouts, from which it goes on to the very end it would have had.
+
+On a GPU it does not: actions are drawn from the GPU's random numbers there, whose state is not kept.
+"""
 
 from collections import deque
 from collections.abc import Iterable, Mapping

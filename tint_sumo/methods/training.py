@@ -84,8 +84,8 @@ def train_policy(
     leaves a checkpoint, and the same call goes on from there. A finished run is not repeated. With
     ``calibration_episodes`` the trained policy is calibrated at the end (``tint_sumo.methods.calibration``).
 
-    The policy follows from the arguments alone: the training computes in one thread, nobody who looks on changes its
-    random numbers, and the process's own are as before when it ends.
+    On a CPU the policy follows from the arguments alone: the training computes in one thread, nobody who looks on
+    changes its random numbers, and the process's own are as before when it ends.
 
     Args:
         method: name of a learned method.

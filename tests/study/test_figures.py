@@ -16,7 +16,7 @@ from tint_sumo.methods.registry import METHODS
 from tint_sumo.study import figures
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_profiles, plot_worlds
-from tint_sumo.study.summary import at_mixes, in_worlds, over_all_mixes, tabulate
+from tint_sumo.study.summary import at_mixes, in_other_conditions, in_worlds, tabulate
 
 AS_TRAINED = Conditions(ALL_MIXES)
 OTHERS = (
@@ -123,7 +123,7 @@ def test_every_method_has_a_curve_of_its_own_look(tmp_path: Path, drawn: Callabl
 def test_each_condition_has_a_panel_through_the_training_s_conditions(
     tmp_path: Path, drawn: Callable[[], Figure]
 ) -> None:
-    assert_picture(plot_conditions(over_all_mixes(ROWS), tmp_path / "conditions.png"))
+    assert_picture(plot_conditions(in_other_conditions(ROWS), tmp_path / "conditions.png"))
     noise, tau, percent = drawn().axes
     shown = [[list(container.lines[0].get_xdata()) for container in axes.containers] for axes in (noise, tau, percent)]
     assert shown[0] == [[0.0, 0.05, 0.1]] * 2
@@ -136,7 +136,7 @@ def test_each_condition_has_a_panel_through_the_training_s_conditions(
 
 def test_methods_of_the_past_are_drawn_under_their_names(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
     rows = tabulate([trained("forgotten", 0, {AS_TRAINED: (1, 1, 0), Conditions(Mix(0.4)): (1, 1, 0)})])
-    assert_picture(plot_conditions(over_all_mixes(rows), tmp_path / "conditions.png"))
+    assert_picture(plot_conditions(in_other_conditions(rows), tmp_path / "conditions.png"))
     assert [container.get_label() for container in drawn().axes[0].containers] == ["forgotten"]
     plot_bars(at_mixes(rows), tmp_path / "bars.png")
     assert drawn().axes[0].get_yticklabels()[0].get_text() == "forgotten"

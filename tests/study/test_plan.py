@@ -78,6 +78,7 @@ def test_a_study_leaves_everything_it_made(finished: Path) -> None:
         "results.csv",
         "results.md",
         "results.png",
+        "conditions.png",
         "curves.png",
     }
     assert not [path for path in made if path.endswith((".partial", ".zip", ".pt", ".pkl"))]
@@ -112,7 +113,7 @@ def test_only_what_is_missing_is_made_again(budget: Budget, finished: Path) -> N
     assert lost.read_text() == content
     assert {row.method for row in report.rows} == {"always_go", "ma", "oracle"}
     changed = {path for path, time in times(finished).items() if before.get(path) != time}
-    written = {"results.csv", "results.md", "results.png", "curves.png", "report.html"}
+    written = {"results.csv", "results.md", "results.png", "conditions.png", "curves.png", "report.html"}
     assert changed == {"results/always_go.json", *written}
 
 

@@ -271,6 +271,33 @@ def test_other_conditions_stand_beside_those_of_the_training(report: StudyReport
     ]
 
 
+def test_conditions_at_several_mixes_are_columns_and_rows_of_their_own() -> None:
+    slow = [Conditions(Mix(p), tau_s=1.5) for p in (0.4, 0.6)]
+    worlds = [Conditions(Mix(0.4), world="towns"), Conditions(ALL_MIXES, percent=50, world="towns")]
+    rows = tabulate([trained("oracle", 0, {conditions: (n, 0, 4 - n) for n, conditions in enumerate(slow + worlds)})])
+    markdown = to_markdown(result_tables(rows, {}))
+    assert tables(markdown) == {
+        "Other conditions and shorter trainings": [
+            ["method", "headway 1.5 s, P 0.4", "headway 1.5 s, P 0.6"],
+            ["oracle", "0.0 (100.0)", "25.0 (75.0)"],
+        ],
+        "Worlds": [
+            ["world", "oracle"],
+            ["128 towns, P 0.4", "50/0/50"],
+            ["128 towns, 50 % of training, P 0.1 to 0.9", "75/0/25"],
+        ],
+    }
+    assert markdown.count("P is P(conservative) of the cases") == 2
+    alone = to_markdown(result_tables(rows[:1], {}))
+    assert "Success (collision) in percent; P(conservative) is 0.4." in alone
+
+
+def test_a_study_in_other_conditions_at_one_mix_has_figures(tmp_path: Path) -> None:
+    tested = dict.fromkeys((Conditions(Mix(0.4), tau_s=1.5), Conditions(Mix(0.4), world="towns")), (2, 1, 1))
+    report = write_report(write_results([trained("oracle", 0, tested)], tmp_path))
+    assert [file.name for file in report.figure_files] == ["conditions.png", "worlds.png"]
+
+
 def test_a_study_with_one_seed_and_no_curves_has_no_differences(tmp_path: Path) -> None:
     report = write_report(write_results(ONE_SEED, tmp_path))
     assert [file.name for file in report.figure_files] == ["results.png", "conditions.png", "worlds.png"]

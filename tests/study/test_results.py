@@ -136,3 +136,9 @@ def damage(study: Path, text: str) -> None:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"result of a study: no file .*gone\.json"):
         Result.read(tmp_path / "gone.json")
+
+
+def test_results_without_a_test_are_refused(tmp_path: Path) -> None:
+    write_results([trained("oracle", 0, {})], tmp_path)
+    with pytest.raises(InputError, match=r"no policy of .* was tested"):
+        read_results(tmp_path)

@@ -16,7 +16,6 @@ from tint_sumo.core.statistics import (
     interquartile_mean,
 )
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
-from tint_sumo.envs.worlds import find_world
 from tint_sumo.methods.registry import METHODS
 from tint_sumo.study.ceiling_job import read_ceilings
 from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_profiles, plot_worlds
@@ -29,9 +28,9 @@ from tint_sumo.study.summary import (
     at_mixes,
     by_method,
     by_title,
-    by_world,
+    in_other_conditions,
     in_worlds,
-    over_all_mixes,
+    labels,
     scores,
     tabulate,
 )
@@ -61,8 +60,8 @@ def write_report(out: Path) -> StudyReport:
     figures = []
     if at_mixes(rows):
         figures.append(plot_bars(at_mixes(rows), out / "results.png"))
-    if over_all_mixes(rows):
-        figures.append(plot_conditions(over_all_mixes(rows), out / "conditions.png"))
+    if in_other_conditions(rows):
+        figures.append(plot_conditions(in_other_conditions(rows), out / "conditions.png"))
     if in_worlds(rows):
         figures.append(plot_worlds(in_worlds(rows), out / "worlds.png"))
     if len(found := scores(rows)) > 1:
@@ -83,7 +82,7 @@ def to_markdown(tables: Sequence[Table]) -> str:
 
 def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
     """Return all tables for readers."""
-    main, varied = at_mixes(rows), over_all_mixes(rows)
+    main, varied, worlds = at_mixes(rows), in_other_conditions(rows), in_worlds(rows)
     tables = []
     if main:
         tables.append(Table("Success by mix of drivers", _success_lines(main, ceilings), _SUCCESS_NOTE))
@@ -94,9 +93,11 @@ def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
     if len(found := scores(rows)) > 1:
         tables.append(Table("Over seeds and conditions", _robust_lines(found), _ROBUST_NOTE))
     if varied:
-        tables.append(Table("Other conditions and shorter trainings", _condition_lines(varied), _CONDITIONS_NOTE))
-    if in_worlds(rows):
-        tables.append(Table("Worlds", _world_lines(in_worlds(rows)), _WORLDS_NOTE))
+        note = f"Success (collision) in percent; {_cases_of(varied)}. As trained: the conditions of the training."
+        tables.append(Table("Other conditions and shorter trainings", _condition_lines(varied), note))
+    if worlds:
+        note = f"Success / timeout / collision in percent; {_cases_of(worlds)}. {_WORLD_NOTE}"
+        tables.append(Table("Worlds", _world_lines(worlds), note))
     return tables
 
 
@@ -120,14 +121,7 @@ _ROBUST_NOTE = (
     "interquartile mean, which is the mean of the middle half, with its 95 % interval; means of the worst and of the "
     "best seed; and the probability that a training beats one of the method without labels (Agarwal et al. 2021)."
 )
-_CONDITIONS_NOTE = (
-    "Success (collision) in percent; every case has its own P(conservative) between 0.1 and 0.9. The first column is "
-    "the conditions of the training."
-)
-_WORLDS_NOTE = (
-    "Success / timeout / collision in percent; every case has its own P(conservative) between 0.1 and 0.9. A world is "
-    "a population of drivers and a sensor."
-)
+_WORLD_NOTE = "A world is a population of drivers and a sensor."
 
 
 def _success_lines(rows: Sequence[Summary], ceilings: Ceilings) -> Lines:
@@ -216,11 +210,11 @@ def _robust_lines(found: Mapping[str, Scores]) -> Lines:
 
 
 def _condition_lines(rows: Sequence[Summary]) -> Lines:
-    varied = list(dict.fromkeys(row.conditions for row in rows))
-    lines = [["method", *(conditions.label for conditions in varied)]]
+    names = labels(rows)
+    lines = [["method", *names.values()]]
     for title, found in by_title(rows).items():
         rates = {row.conditions: [percent(row.rate(outcome)) for outcome in ("success", "collision")] for row in found}
-        cells = ["{} ({})".format(*rates[conditions]) if conditions in rates else "-" for conditions in varied]
+        cells = ["{} ({})".format(*rates[conditions]) if conditions in rates else "-" for conditions in names]
         lines.append([title, *cells])
     return lines
 
@@ -228,10 +222,21 @@ def _condition_lines(rows: Sequence[Summary]) -> Lines:
 def _world_lines(rows: Sequence[Summary]) -> Lines:
     titles = list(by_title(rows))
     lines = [["world", *titles]]
-    for world, found in by_world(rows).items():
+    for conditions, name in labels(rows).items():
+        found = [row for row in rows if row.conditions == conditions]
         at = {row.title: "/".join(f"{100 * row.rate(outcome):.0f}" for outcome in BUILT_IN_OUTCOMES) for row in found}
-        lines.append([find_world(world).title, *(at.get(title, "-") for title in titles)])
+        lines.append([name, *(at.get(title, "-") for title in titles)])
     return lines
+
+
+def _cases_of(rows: Sequence[Summary]) -> str:
+    """Return a clause about P(conservative) of the cases."""
+    first, *others = {row.conditions.p_conservative for row in rows}
+    if others:
+        return "P is P(conservative) of the cases"
+    if first.is_single:
+        return f"P(conservative) is {first.text}"
+    return f"every case has its own P(conservative) between {first.low:g} and {first.high:g}"
 
 
 def _number(row: Summary) -> float:

@@ -13,7 +13,7 @@ from tint_sumo.config import WORLDS, Mix
 from tint_sumo.core.statistics import Hits, Interval, Scores, rate_interval
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.evaluation import Evaluation
-from tint_sumo.methods.registry import METHODS, Learned
+from tint_sumo.methods.registry import METHODS, Learned, Look, look_of
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.published import RATES_PERCENT
 from tint_sumo.study.results import GIVEN, Result
@@ -156,7 +156,7 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
         result, conditions = pair[0], pair[1].conditions
         headway_s = 0.0 if conditions.tau_s is None else conditions.tau_s - result.scene_tau_s
         return (
-            -1 if conditions.world is None else list(WORLDS).index(conditions.world),
+            _position_of_world(conditions),
             -conditions.percent,
             conditions.position_noise_m,
             abs(headway_s),  # the difference from the scene's
@@ -186,15 +186,16 @@ def at_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
     return [row for row in rows if row.conditions.is_single_mix]
 
 
-def over_all_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:
-    """Return the rows of other conditions and parts of the training, where every case draws its mix."""
-    return [row for row in rows if not row.conditions.p_conservative.is_single and row.conditions.world is None]
+def in_other_conditions(rows: Sequence[AnyRow]) -> list[AnyRow]:
+    """Return the rows outside of worlds that the main table lacks, and those of the same mixes beside them."""
+    outside = [row for row in rows if row.conditions.world is None]
+    mixes = {row.conditions.p_conservative for row in outside if not row.conditions.is_single_mix}
+    return [row for row in outside if row.conditions.p_conservative in mixes]
 
 
 def in_worlds(rows: Sequence[AnyRow]) -> list[AnyRow]:
-    """Return the rows of fully trained policies in worlds, where every case draws its mix."""
-    found = [row for row in rows if row.conditions.world is not None and row.conditions.percent == 100]
-    return [row for row in found if not row.conditions.p_conservative.is_single]
+    """Return the rows of policies in worlds."""
+    return [row for row in rows if row.conditions.world is not None]
 
 
 def by_method(rows: Sequence[AnyRow]) -> list[AnyRow]:
@@ -211,9 +212,37 @@ def by_title(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
     return found
 
 
-def by_world(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
-    """Return the rows of each world, in the order of ``WORLDS``."""
-    return {world: found for world in WORLDS if (found := [row for row in rows if row.conditions.world == world])}
+def by_line(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
+    """Return the rows of each line of a chart: a method at one P(conservative), named where there are several."""
+    found: dict[str, list[AnyRow]] = {}
+    for title, own in by_title(rows).items():
+        for row in own:
+            found.setdefault(title + _mix_among(rows, row.conditions), []).append(row)
+    return found
+
+
+def labels(rows: Sequence[Summary]) -> dict[Conditions, str]:
+    """Return the names of the rows' conditions, which have P(conservative) where there are several of it.
+
+    Worlds have the order of ``WORLDS``.
+    """
+    found = sorted(dict.fromkeys(row.conditions for row in rows), key=_position_of_world)
+    return {conditions: conditions.label + _mix_among(rows, conditions) for conditions in found}
+
+
+def looks(lines: Mapping[str, Sequence[Summary]]) -> list[Look]:
+    """Return how each line of a chart is drawn: those of one method have its colour, and other markers."""
+    kinds = [(rows[0].method, rows[0].is_shipped) for rows in lines.values()]
+    return [look_of(kind[0]).variant(kinds[:position].count(kind)) for position, kind in enumerate(kinds)]
+
+
+def _mix_among(rows: Sequence[Summary], conditions: Conditions) -> str:
+    mixes = {row.conditions.p_conservative for row in rows}
+    return f", P {conditions.p_conservative.text}" if len(mixes) > 1 else ""
+
+
+def _position_of_world(conditions: Conditions) -> int:
+    return -1 if conditions.world is None else list(WORLDS).index(conditions.world)
 
 
 def scores(rows: Sequence[Row]) -> dict[str, Scores]:

@@ -7,7 +7,7 @@ from tint_sumo.core.percentages import percent
 from tint_sumo.envs.worlds import find_world
 from tint_sumo.methods.registry import METHODS, Learned
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.summary import Summary, at_mixes, by_title, in_worlds, over_all_mixes
+from tint_sumo.study.summary import Summary, at_mixes, by_title, in_worlds
 
 MEANING_OF_P = (
     "P is P(conservative): the probability that a driver is conservative, and yields when the ego moves in front of "
@@ -21,8 +21,9 @@ def what_came_out(rows: Sequence[Summary]) -> str:
     Rates are means over the mixes of drivers that all methods were tested on, or over worlds if policies were tested
     in these alone; empty where there is none.
     """
-    as_trained = [row for row in over_all_mixes(rows) if row.conditions == Conditions(row.conditions.p_conservative)]
-    methods = by_title(at_mixes(rows) or as_trained or in_worlds(rows))
+    as_trained = [row for row in rows if row.conditions == Conditions(row.conditions.p_conservative)]
+    whole = [row for row in in_worlds(rows) if row.conditions.percent == 100]
+    methods = by_title(at_mixes(rows) or as_trained or whole)
     common = (
         set.intersection(*({row.conditions for row in tested} for tested in methods.values())) if methods else set()
     )

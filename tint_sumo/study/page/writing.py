@@ -27,7 +27,7 @@ from tint_sumo.study.page.findings import MEANING_OF_P, what_came_out
 from tint_sumo.study.page.html import chart, content_policy, folded, json_data, packed, paragraph, section, table
 from tint_sumo.study.page.latents import read_latents
 from tint_sumo.study.report import StudyReport
-from tint_sumo.study.summary import Row, at_mixes, in_worlds, over_all_mixes
+from tint_sumo.study.summary import Row, at_mixes, in_other_conditions, in_worlds
 from tint_sumo.study.tables import Lines, Table
 
 PAGE_FILE = "report.html"
@@ -175,7 +175,7 @@ def _curves(study: _Study, charts: list[Chart]) -> str:
 
 
 def _conditions(study: _Study, charts: list[Chart]) -> str:
-    varied = over_all_mixes(study.rows)
+    varied = in_other_conditions(study.rows)
     if not varied:
         return _left_out("the study tested its policies in the conditions of their training alone")
     shown = [_shown(drawn, charts) for drawn in condition_charts(varied)]

@@ -156,9 +156,11 @@ def test_worlds_have_a_line_each_and_methods_a_marker(tmp_path: Path, drawn: Cal
 
 
 def test_profiles_fall_from_all_trainings_to_none(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
-    found = {"oracle": np.array([[0.9, 0.8], [0.9, 0.2]]), "no labels": np.array([[0.5, 0.5]])}
+    found = {"oracle": np.array([[0.9, 0.8], [0.9, 0.2]]), "own": np.array([[0.5, 0.5]])}
     assert_picture(plot_profiles(found, tmp_path / "profiles.png"))
-    oracle, other = (line.get_xydata() for line in drawn().axes[0].get_lines())
+    lines = drawn().axes[0].get_lines()
+    assert [line.get_label() for line in lines] == ["oracle", "own"], "a method that nobody has registered has a line"
+    oracle, other = (line.get_xydata() for line in lines)
     at = {round(float(success)): share for success, share in oracle.tolist()}
     assert [at[success] for success in (0, 30, 85, 95)] == [100.0, 75.0, 50.0, 0.0]
     assert other[0, 1] == 100.0 and other[-1, 1] == 0.0

@@ -17,7 +17,17 @@ from tint_sumo.core.statistics import Scores
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import METHODS, Look, look_of
 from tint_sumo.study.jobs import smoothed_percent
-from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_line, by_title, labels, looks, marker_offset, varied
+from tint_sumo.study.summary import (
+    CONDITION_TITLES,
+    Summary,
+    by_line,
+    by_title,
+    labels,
+    looks,
+    marker_offset,
+    title_of,
+    varied,
+)
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
 INK = {"success": "white", "timeout": "black", "collision": "white"}  # colours of the numbers on these colours
@@ -118,16 +128,15 @@ def plot_conditions(rows: Sequence[Summary], file: Path) -> Path:
 def plot_profiles(found: Mapping[str, Scores], file: Path) -> Path:
     """Draw performance profiles: the share of trainings and conditions in which a method succeeds more often than this.
 
-    A line that falls early shows trainings that fail (Agarwal et al. 2021). ``found`` has success (S, T) by title.
+    A line that falls early shows trainings that fail (Agarwal et al. 2021). ``found`` has success (S, T) by method.
     """
-    names = {method.title: name for name, method in METHODS.items()}
     figure = Figure(figsize=(7.5, 4.6), dpi=150, layout="constrained")
     axes = figure.subplots()
     thresholds = np.linspace(0.0, 1.0, 201)
-    for title, scores in found.items():
+    for method, scores in found.items():
         shares = (scores.flatten()[:, None] > thresholds).mean(axis=0)
-        style = _line_style(look_of(names[title])) | {"markevery": 0.12}
-        axes.plot(100.0 * thresholds, 100.0 * shares, label=title, **style)
+        style = _line_style(look_of(method)) | {"markevery": 0.12}
+        axes.plot(100.0 * thresholds, 100.0 * shares, label=title_of(method), **style)
     axes.set(xlabel="success (%)", ylabel="trainings and conditions with more than that (%)")
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize=8, ncols=2)

@@ -16,7 +16,6 @@ from tint_sumo.core.statistics import (
     interquartile_mean,
 )
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
-from tint_sumo.methods.registry import METHODS
 from tint_sumo.study.ceiling_job import read_ceilings
 from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_profiles, plot_worlds
 from tint_sumo.study.jobs import read_curves
@@ -33,6 +32,7 @@ from tint_sumo.study.summary import (
     labels,
     scores,
     tabulate,
+    title_of,
 )
 from tint_sumo.study.tables import Lines, Table
 
@@ -195,9 +195,9 @@ def _difference(row: Row | None, other: Row | None) -> str:
 
 
 def _robust_lines(found: Mapping[str, Scores]) -> Lines:
-    reference = found.get(METHODS["no_labels"].title)
+    reference = found.get("no_labels")
     lines = [["method", "seeds", "interquartile mean", "worst seed", "best seed", "beats no labels %"]]
-    for title, method_scores in found.items():
+    for method, method_scores in found.items():
         means = method_scores.mean(axis=1)
         chance = "-"
         if reference is not None and reference is not method_scores:
@@ -205,7 +205,8 @@ def _robust_lines(found: Mapping[str, Scores]) -> Lines:
                 improvement(method_scores, reference), improvement_interval(method_scores, reference)
             )
         middle = percent_and_ends(interquartile_mean(method_scores), interquartile_interval(method_scores))
-        lines.append([title, str(len(means)), middle, percent(float(means.min())), percent(float(means.max())), chance])
+        worst, best = percent(float(means.min())), percent(float(means.max()))
+        lines.append([title_of(method), str(len(means)), middle, worst, best, chance])
     return lines
 
 

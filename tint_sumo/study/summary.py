@@ -71,8 +71,7 @@ class Summary(ABC):
 
     @property
     def title(self) -> str:
-        method = METHODS.get(self.method)
-        title = self.method if method is None else method.title
+        title = title_of(self.method)
         return f"{title} (old world)" if self.is_shipped else title
 
     @property
@@ -142,6 +141,11 @@ class Row(Summary):
             "collisions": self.collisions,
             "published_percent": self.published or None,
         }
+
+
+def title_of(method: str) -> str:
+    """Return a method's name for readers; the name itself if nobody has registered it."""
+    return METHODS[method].title if method in METHODS else method
 
 
 AnyRow = TypeVar("AnyRow", bound=Summary)
@@ -246,17 +250,15 @@ def _position_of_world(conditions: Conditions) -> int:
 
 
 def scores(rows: Sequence[Row]) -> dict[str, Scores]:
-    """Return success (S, T) of each method with several trainings, in the conditions that all of these share.
+    """Return success (S, T) by method, of those with several trainings, in the conditions that all of these share.
 
     Parts of trainings are left out. The mix of the training is part of the conditions.
     """
-    several = [row for row in rows if len(row.seeds) > 1 and row.conditions.percent == 100]
-    by_task = {
-        title: {(row.mix, row.conditions): row.hits("success").mean(axis=1) for row in found}
-        for title, found in by_title(several).items()
-    }
+    by_task: dict[str, dict[tuple[Mix | None, Conditions], Any]] = {}
+    for row in by_method([row for row in rows if len(row.seeds) > 1 and row.conditions.percent == 100]):
+        by_task.setdefault(row.method, {})[row.mix, row.conditions] = row.hits("success").mean(axis=1)
     common = [task for task in next(iter(by_task.values()), {}) if all(task in found for found in by_task.values())]
-    return {title: np.stack([found[task] for task in common], axis=1) for title, found in by_task.items() if common}
+    return {method: np.stack([found[task] for task in common], axis=1) for method, found in by_task.items() if common}
 
 
 def marker_offset(position: int, count: int, most: float) -> float:

@@ -13,6 +13,7 @@ from tint_sumo.core.statistics import Rate, difference_interval, interquartile_m
 from tint_sumo.methods.training import CURVE_FILE
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE
+from tint_sumo.study.page.findings import what_came_out
 from tint_sumo.study.report import StudyReport, result_tables, to_markdown, write_report
 from tint_sumo.study.results import Result
 from tint_sumo.study.results_csv import read_csv, to_csv
@@ -259,6 +260,35 @@ def test_methods_that_did_not_meet_the_same_cases_are_not_compared() -> None:
     rows = tabulate([*SEVERAL_SEEDS[:3], *fewer])
     (line,) = tables(to_markdown(result_tables(rows, {})))["Differences in success"][1:]
     assert line == ["paper's method", "oracle", "-", "-"]
+
+
+def test_policies_that_were_trained_at_several_mixes_are_told_apart(tmp_path: Path) -> None:
+    at, noisy, world = Conditions(Mix(0.4)), Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, world="towns")
+    successes = {("oracle", ALL_MIXES): 8, ("oracle", Mix(0.4)): 2, ("no_labels", ALL_MIXES): 5}
+    results = [
+        trained(method, seed, dict.fromkeys((at, noisy, world), (n, 10 - n, 0)), mix)
+        for (method, mix), n in successes.items()
+        for seed in range(2)
+    ]
+    rows = tabulate(results)
+    found = tables(to_markdown(result_tables(rows, {})))
+    no_labels = "no labels (trained at P 0.1 to 0.9)"
+    oracle, oracle_at = "oracle (trained at P 0.1 to 0.9)", "oracle (trained at P 0.4)"
+    assert [[line[0], line[2]] for line in found["Success by mix of drivers"][1:]] == [
+        [no_labels, "50.0 ± 0.0"],
+        [oracle, "80.0 ± 0.0"],
+        [oracle_at, "20.0 ± 0.0"],
+    ]
+    assert [[*line[:2], line[2].split()[0]] for line in found["Differences in success"][1:]] == [
+        [no_labels, oracle, "-30.0"],
+        [oracle, no_labels, "+30.0"],
+    ]
+    assert [line[0] for line in found["Other conditions and shorter trainings"]][1:] == [no_labels, oracle, oracle_at]
+    assert found["Worlds"] == [["world", no_labels, oracle, oracle_at], ["128 towns", "50/50/0", "80/20/0", "20/80/0"]]
+    write_text(tmp_path / "results.csv", to_csv(rows, {}))
+    assert [row.title for row in read_csv(tmp_path / "results.csv")[0]] == [row.title for row in rows]
+    assert [row.to_json()["trained_p_conservative"] for row in rows[:3]] == [[0.1, 0.9], [0.1, 0.9], 0.4]
+    assert what_came_out(rows).startswith("At P 0.4 all 2 methods succeeded in 50.0 % of the cases")
 
 
 def test_other_conditions_stand_beside_those_of_the_training(report: StudyReport) -> None:

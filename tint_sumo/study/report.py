@@ -113,8 +113,8 @@ _OUTCOME_NOTE = (
 )
 _COLLISION_NOTE = "Collisions in 1,000 cases by trait and route of the driver that was hit, over all seeds and mixes."
 _DIFFERENCE_NOTE = (
-    "Difference to another method's success on the same cases, in percentage points with 95 % intervals over seeds and "
-    "cases (bootstrap)."
+    "Difference to another method's success on the same cases, of trainings at the same mix, in percentage points with "
+    "95 % intervals over seeds and cases (bootstrap)."
 )
 _ROBUST_NOTE = (
     "Success in percent over all fully trained policies and all conditions that every method was tested in: the "
@@ -178,12 +178,11 @@ def _difference_lines(rows: Sequence[Row]) -> Lines:
     mixes = sorted({_number(row) for row in trained})
     lines = [["method", "less", *(f"P {p:g}" for p in mixes)]]
     for other in ("oracle", "no_labels"):
-        references = {_number(row): row for row in trained if row.method == other}
-        for method in dict.fromkeys(row.method for row in by_method(trained) if row.method != other):
-            at = {_number(row): row for row in trained if row.method == method}
-            if references and at:
-                cells = [_difference(at.get(p), references.get(p)) for p in mixes]
-                lines.append([next(iter(at.values())).title, next(iter(references.values())).title, *cells])
+        for title, found in by_title([row for row in trained if row.method != other]).items():
+            same = [row for row in trained if (row.method, row.mix) == (other, found[0].mix)]
+            if same:
+                at, references = ({_number(row): row for row in rows} for rows in (found, same))
+                lines.append([title, same[0].title, *(_difference(at.get(p), references.get(p)) for p in mixes)])
     return lines
 
 

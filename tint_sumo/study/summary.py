@@ -1,8 +1,8 @@
 """The rows of the results: all seeds of a method under the same conditions."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 from typing import Any, TypeVar
@@ -35,6 +35,7 @@ class Summary(ABC):
     conditions: Conditions
     seeds: tuple[int, ...]
     scene_tau_s: float  # headway of the scene's drivers
+    named_mix: Mix | None = field(default=None, kw_only=True)  # that of the training, where a study has several
 
     @property
     def resolved(self) -> Conditions:
@@ -71,8 +72,7 @@ class Summary(ABC):
 
     @property
     def title(self) -> str:
-        title = title_of(self.method)
-        return f"{title} (old world)" if self.is_shipped else title
+        return title_of(self.method, self.named_mix) + (" (old world)" if self.is_shipped else "")
 
     @property
     def published(self) -> dict[str, float]:
@@ -127,6 +127,7 @@ class Row(Summary):
         return {
             "method": self.method,
             "origin": self.origin,
+            "trained_p_conservative": None if self.mix is None else self.mix.plain(),
             "p_conservative": self.conditions.p_conservative.plain(),
             "position_noise_m": self.conditions.position_noise_m,
             "tau_s": self.resolved.tau_s,
@@ -143,9 +144,16 @@ class Row(Summary):
         }
 
 
-def title_of(method: str) -> str:
-    """Return a method's name for readers; the name itself if nobody has registered it."""
-    return METHODS[method].title if method in METHODS else method
+def title_of(method: str, named_mix: Mix | None = None) -> str:
+    """Return a method's name for readers, with the mix of a training; as it is if nobody has registered it."""
+    title = METHODS[method].title if method in METHODS else method
+    return title if named_mix is None else f"{title} (trained at P {named_mix.text})"
+
+
+def named(mixes: Iterable[Mix | None]) -> Callable[[Mix | None], Mix | None]:
+    """Return which mix of a training its title names: its own if there are several among all of these, else none."""
+    is_several = len(set(mixes) - {None}) > 1
+    return lambda mix: mix if is_several else None
 
 
 AnyRow = TypeVar("AnyRow", bound=Summary)
@@ -173,14 +181,23 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
             (result.mix is None, result.mix),
         )
 
-    rows = []
+    rows, named_mix = [], named(result.mix for result in results)
     for _, group in groupby(sorted(flat, key=key), key):
         members = sorted(group, key=lambda pair: pair[0].seed)
         first, tested = members[0]
         seeds = tuple(result.seed for result, _ in members)
         evaluations = tuple(test.evaluation for _, test in members)
         rows.append(
-            Row(first.method, first.origin, first.mix, tested.conditions, seeds, first.scene_tau_s, evaluations)
+            Row(
+                first.method,
+                first.origin,
+                first.mix,
+                tested.conditions,
+                seeds,
+                first.scene_tau_s,
+                evaluations,
+                named_mix=named_mix(first.mix),
+            )
         )
     return rows
 
@@ -203,13 +220,17 @@ def in_worlds(rows: Sequence[AnyRow]) -> list[AnyRow]:
 
 
 def by_method(rows: Sequence[AnyRow]) -> list[AnyRow]:
-    """Return the rows in the registry's order, whatever the conditions; shipped policies come first."""
+    """Return the rows in the registry's order and that of mixes in training; shipped policies come first."""
     order = {name: position for position, name in enumerate(METHODS)}
-    return sorted(rows, key=lambda row: (order.get(row.method, len(order)), row.origin != GIVEN))
+
+    def key(row: AnyRow) -> tuple[Any, ...]:
+        return order.get(row.method, len(order)), row.origin != GIVEN, row.mix is not None, row.mix
+
+    return sorted(rows, key=key)
 
 
 def by_title(rows: Sequence[AnyRow]) -> dict[str, list[AnyRow]]:
-    """Return the rows of each method, shipped policies apart, in the registry's order."""
+    """Return the rows of each method and mix in training, shipped policies apart, in the registry's order."""
     found: dict[str, list[AnyRow]] = {}
     for row in by_method(rows):
         found.setdefault(row.title, []).append(row)

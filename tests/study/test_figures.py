@@ -97,7 +97,7 @@ def test_a_single_bar_is_a_figure_too(tmp_path: Path) -> None:
 
 
 def test_curves_are_means_over_seeds(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
-    curves = {"oracle": [curve(0.2, 0.4), curve(0.4, 0.8)], "ma": [curve(0.1, 0.1)]}
+    curves = {("oracle", ALL_MIXES): [curve(0.2, 0.4), curve(0.4, 0.8)], ("ma", ALL_MIXES): [curve(0.1, 0.1)]}
     assert_picture(plot_curves(curves, tmp_path / "curves.png"))
     axes = drawn().axes[0]
     oracle, ma = axes.get_lines()
@@ -107,17 +107,28 @@ def test_curves_are_means_over_seeds(tmp_path: Path, drawn: Callable[[], Figure]
 
 
 def test_seeds_are_compared_as_far_as_all_of_them_have_come(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
-    curves = {"oracle": [curve(0.2, 0.2, 0.2), curve(0.4)]}
+    curves = {("oracle", ALL_MIXES): [curve(0.2, 0.2, 0.2), curve(0.4)]}
     assert_picture(plot_curves(curves, tmp_path / "curves.png"))
     np.testing.assert_allclose(drawn().axes[0].get_lines()[0].get_ydata(), [30.0])
 
 
 def test_every_method_has_a_curve_of_its_own_look(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
-    curves = {name: [curve(0.2, 0.4)] for name in METHODS}
+    curves = {(name, ALL_MIXES): [curve(0.2, 0.4)] for name in METHODS}
     assert_picture(plot_curves(curves, tmp_path / "curves.png"))
     lines = drawn().axes[0].get_lines()
     looks = [(line.get_color(), line.get_marker(), line.get_linestyle()) for line in lines]
     assert looks == [(one.look.colour, one.look.marker, one.look.dash) for one in METHODS.values()]
+
+
+def test_trainings_at_several_mixes_have_curves_of_their_own(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    curves = {("oracle", Mix(0.25)): [curve(0.2)], ("oracle", Mix(0.4)): [curve(0.4), curve(0.6)]}
+    assert_picture(plot_curves(curves, tmp_path / "curves.png"))
+    axes = drawn().axes[0]
+    first, second = axes.get_lines()
+    assert [first.get_label(), second.get_label()] == ["oracle (trained at P 0.25)", "oracle (trained at P 0.4)"]
+    assert [list(first.get_ydata()), list(second.get_ydata())] == [[20.0], [50.0]]
+    assert first.get_color() == second.get_color() and first.get_marker() != second.get_marker()
+    assert axes.get_ylabel() == "success in training (%)"
 
 
 def test_each_condition_has_a_panel_through_the_training_s_conditions(

@@ -1,6 +1,6 @@
 """Figures of a study's results."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tint_sumo.config import ALL_MIXES
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.files import whole_file
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.statistics import Scores
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
-from tint_sumo.methods.registry import METHODS, Look, look_of
+from tint_sumo.methods.registry import Look, look_of
 from tint_sumo.study.jobs import smoothed_percent
 from tint_sumo.study.summary import (
     CONDITION_TITLES,
@@ -26,6 +26,7 @@ from tint_sumo.study.summary import (
     looks,
     marker_offset,
     title_of,
+    titles_and_looks,
     varied,
 )
 
@@ -89,21 +90,23 @@ def _plot_panel(axes: Axes, rows: Sequence[Summary]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Path:
+def plot_curves(curves: Mapping[tuple[str, Mix], Sequence[pd.DataFrame]], file: Path) -> Path:
     """Draw success in training against decisions: the mean over seeds, and the range between them as a band.
 
     Args:
-        curves: of each method, a frame per seed with columns decisions and success.
+        curves: of each method and mix in training, a frame per seed with columns decisions and success.
         file: of the PNG.
     """
     figure = Figure(figsize=(7.5, 4.6), dpi=150, layout="constrained")
     axes = figure.subplots()
-    for method, seeds in curves.items():
+    for seeds, (title, look) in zip(curves.values(), titles_and_looks(curves), strict=True):
         success = smoothed_percent(seeds)
-        at, style = success.index.to_numpy(), _line_style(look_of(method)) | {"markevery": 0.12}
-        axes.plot(at, success.mean(axis=1), label=METHODS[method].title, **style)
+        at, style = success.index.to_numpy(), _line_style(look) | {"markevery": 0.12}
+        axes.plot(at, success.mean(axis=1), label=title, **style)
         axes.fill_between(at, success.min(axis=1), success.max(axis=1), color=style["color"], alpha=0.12, lw=0)
-    axes.set(xlabel="decisions", ylabel="success in training, all mixes (%)", ylim=(0, 100))
+    axes.set(
+        xlabel="decisions", ylabel=f"success in training{_cases_at({mix for _, mix in curves})} (%)", ylim=(0, 100)
+    )
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize=8, ncols=2)
     return _write(figure, file)
@@ -167,8 +170,12 @@ def plot_worlds(rows: Sequence[Summary], file: Path) -> Path:
 
 
 def _cases_of(rows: Sequence[Summary]) -> str:
+    return _cases_at({row.conditions.p_conservative for row in rows})
+
+
+def _cases_at(mixes: Collection[Mix]) -> str:
     """Return words about P(conservative) of the cases for the name of an axis; none where lines are named by it."""
-    first, *others = {row.conditions.p_conservative for row in rows}
+    first, *others = mixes
     if others:
         return ""
     return ", all mixes" if first == ALL_MIXES else f", P {first.text}"

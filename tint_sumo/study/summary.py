@@ -257,7 +257,19 @@ def labels(rows: Sequence[Summary]) -> dict[Conditions, str]:
 
 def looks(lines: Mapping[str, Sequence[Summary]]) -> list[Look]:
     """Return how each line of a chart is drawn: those of one method have its colour, and other markers."""
-    kinds = [(rows[0].method, rows[0].is_shipped) for rows in lines.values()]
+    return _variants([(rows[0].method, rows[0].is_shipped) for rows in lines.values()])
+
+
+def titles_and_looks(trainings: Iterable[tuple[str, Mix]]) -> list[tuple[str, Look]]:
+    """Return the title of each method and mix in training, and how its learning curve is drawn."""
+    kinds = list(trainings)
+    named_mix = named(mix for _, mix in kinds)
+    titles = [title_of(method, named_mix(mix)) for method, mix in kinds]
+    return list(zip(titles, _variants([(method, False) for method, _ in kinds]), strict=True))
+
+
+def _variants(kinds: Sequence[tuple[str, bool]]) -> list[Look]:
+    """Return the look of each line, by its method and whether it has open markers."""
     return [look_of(kind[0]).variant(kinds[:position].count(kind)) for position, kind in enumerate(kinds)]
 
 

@@ -7,10 +7,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from tint_sumo.config import Mix
 from tint_sumo.core.percentages import percent
-from tint_sumo.methods.registry import METHODS, Look, look_of
+from tint_sumo.methods.registry import Look
 from tint_sumo.study.jobs import smoothed_percent
-from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_line, by_title, labels, looks, marker_offset, varied
+from tint_sumo.study.summary import (
+    CONDITION_TITLES,
+    Summary,
+    by_line,
+    by_title,
+    labels,
+    looks,
+    marker_offset,
+    titles_and_looks,
+    varied,
+)
 from tint_sumo.study.tables import Lines
 
 # Plotly's names for Matplotlib's markers and line styles.
@@ -68,14 +79,13 @@ def outcome_chart(rows: Sequence[Summary], outcome: str) -> Chart:
     return Chart(outcome, description.capitalize(), lines, {"data": traces, "layout": layout})
 
 
-def curve_chart(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Chart:
+def curve_chart(curves: Mapping[tuple[str, Mix], Sequence[pd.DataFrame]]) -> Chart:
     """Return the chart of success in training against decisions: the mean over the seeds, and their range as a band."""
     traces: list[dict[str, Any]] = []
     lines = [["method", "decisions", "success %", "range of the seeds"]]
-    for method, seeds in curves.items():
-        look = look_of(method)
+    for seeds, (title, look) in zip(curves.values(), titles_and_looks(curves), strict=True):
         success = smoothed_percent(seeds)
-        at, title = success.index.to_numpy(), METHODS[method].title
+        at = success.index.to_numpy()
         middle, low, high = success.mean(axis=1), success.min(axis=1), success.max(axis=1)
         if len(seeds) > 1:
             traces.append(_band(at, low.to_numpy(), high.to_numpy(), look))

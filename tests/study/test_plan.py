@@ -62,6 +62,18 @@ def test_a_headway_that_is_the_scene_s_is_planned_like_one_that_is_not_given(tmp
     assert tests and all(job.trials == planned for job in tests)
 
 
+@pytest.mark.parametrize(
+    "trials",
+    [
+        (Trials((AT_MIX, Conditions(Mix(0.4), tau_s=Idm.tau_s)), 3),),  # the headway is the scene's
+        (Trials((AT_MIX,), 3), Trials((AT_MIX,), 5)),
+    ],
+)
+def test_the_same_conditions_twice_are_refused(trials: tuple[Trials, ...], budget: Budget, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"each conditions once, not P\(conservative\) 0\.4 as trained 2 times"):
+        plan(replace(budget, trials=trials), tmp_path)
+
+
 @pytest.mark.slow
 def test_a_study_leaves_everything_it_made(finished: Path) -> None:
     made = {str(path.relative_to(finished)) for path in finished.rglob("*")}

@@ -92,7 +92,8 @@ class Trials:
     episodes: Annotated[int, Range(1, 1_000_000)]
 
     def __post_init__(self) -> None:
-        require_distinct(self, "conditions")
+        if not self.conditions:
+            raise InputError("conditions must be one or more")
         require_ranges(self)
 
     def relative_to(self, scene_tau_s: float) -> "Trials":

@@ -1,5 +1,6 @@
 """The whole study: record, learn traits, train and test every policy, report."""
 
+from collections import Counter
 from pathlib import Path
 
 from tint_sumo.core.errors import InputError
@@ -11,7 +12,7 @@ from tint_sumo.methods.loading import shipped_policies
 from tint_sumo.methods.registry import Learned, Rule, find_learned, find_method, with_shared_trainings
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, Scene, described, find_scene, paper_scene, require_built_in
 from tint_sumo.scenes.drivers import require_two_kinds
-from tint_sumo.study.budgets import Budget
+from tint_sumo.study.budgets import Budget, Trials
 from tint_sumo.study.ceiling_job import CeilingJob
 from tint_sumo.study.folders import DATASET
 from tint_sumo.study.jobs import EvaluateJob, TrainJob
@@ -35,7 +36,7 @@ def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
     encoders = dict.fromkeys(filter(None, (find_learned(name).encoder for name in trained)))
     traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
     given = rules + (shipped_policies() if budget.with_shipped and base == paper_scene() else [])
-    trials = tuple(trials.relative_to(scene.tau_s) for trials in budget.trials)
+    trials = _trials_in(scene, budget)
     jobs: list[Job] = [*traits]
     for seed in budget.seeds:
         trainings = [
@@ -47,6 +48,23 @@ def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
         jobs += [EvaluateJob(name, mix, seed, trials, out, scene) for mix in budget.mixes for name in learned]
     tests = [EvaluateJob(name, None, 0, trials, out, scene) for name in given]
     return [*jobs, CeilingJob(trials, out, scene), *tests]
+
+
+def _trials_in(scene: Scene, budget: Budget) -> tuple[Trials, ...]:
+    """Return the tests of a budget in a scene.
+
+    Raises:
+        InputError: there are the same conditions twice, whose cases would count as those of more seeds.
+    """
+    trials = tuple(trials.relative_to(scene.tau_s) for trials in budget.trials)
+    counts = Counter(conditions for one in trials for conditions in one.conditions)
+    for conditions, count in counts.items():
+        if count > 1:
+            raise InputError(
+                f"trials must have each conditions once, not P(conservative) {conditions.p_conservative.text} "
+                f"{conditions.label} {count} times; a headway of {scene.tau_s:g} s is that of the scene's drivers"
+            )
+    return trials
 
 
 def run_study(

@@ -1,5 +1,6 @@
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ from PIL import Image
 from tests.study.scenes import given, trained, write_results
 from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.files import write_json, write_text
+from tint_sumo.core.files import RUN_FILE, write_json, write_text
 from tint_sumo.core.statistics import Rate, difference_interval, interquartile_mean, rate_interval
 from tint_sumo.methods.training import CURVE_FILE
+from tint_sumo.scenes import described, find_scene
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE
 from tint_sumo.study.page.findings import what_came_out
@@ -160,6 +162,32 @@ def test_csv_values_of_one_seed() -> None:
     )
     assert (ttc["success_sd_percent"], ttc["ceiling_percent"], ttc["paper_success_percent"]) == ("", "", "")
     assert (half["position_noise_m"], half["tau_s"], half["success_percent"]) == ("0", "1", "70.00")
+
+
+def test_the_ceiling_stands_beside_the_traffic_that_it_was_computed_for() -> None:
+    other = (Conditions(Mix(0.4), tau_s=1.5), Conditions(Mix(0.4), 0.1), Conditions(Mix(0.4), world="towns"))
+    rows = tabulate([given("ttc", dict.fromkeys((Conditions(Mix(0.4)), *other), (1, 0, 0)))])
+    lines = csv.DictReader(to_csv(rows, {0.4: 0.995}).splitlines())
+    assert [line["ceiling_percent"] for line in lines] == ["99.50", "", "", ""]
+
+
+@pytest.mark.parametrize(
+    ("settings", "paper"),
+    [
+        ({"kind": "study"}, "90"),
+        ({"kind": "study", "world": "old"}, "90"),
+        ({"kind": "study", "world": "range_15"}, ""),
+        ({"kind": "study", **described([find_scene("roundabout")])}, ""),
+    ],
+)
+def test_the_paper_s_rates_stand_beside_studies_of_its_scene_and_sensor(
+    settings: dict[str, Any], paper: str, tmp_path: Path
+) -> None:
+    write_json(tmp_path / RUN_FILE, settings)
+    report = write_report(write_results([trained("oracle", 0, {Conditions(Mix(0.4)): (1, 0, 0)})], tmp_path))
+    (line,) = csv.DictReader(report.csv_file.read_text().splitlines())
+    assert line["paper_success_percent"] == paper
+    assert read_csv(report.csv_file)[0][0].published == report.rows[0].published
 
 
 def test_every_table_of_several_seeds_is_there(report: StudyReport) -> None:

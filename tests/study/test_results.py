@@ -63,7 +63,8 @@ def test_a_file_without_the_scene_s_headway_is_of_drivers_with_the_default_one(s
 
 def test_a_policy_that_no_test_is_for_has_no_cases(tmp_path: Path) -> None:
     untested = trained("oracle", 0, {}, mix=Mix(0.25))
-    assert read_results(write_results([untested], tmp_path)) == [untested]
+    results = [untested, *SOME_RESULTS]
+    assert read_results(write_results(results, tmp_path)) == results
 
 
 def test_results_of_a_sweep_are_no_study_s(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plo
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.results import read_results
 from tint_sumo.study.results_csv import Ceilings, to_csv
+from tint_sumo.study.settings import published_for
 from tint_sumo.study.summary import (
     Row,
     Summary,
@@ -56,7 +57,7 @@ def write_report(out: Path) -> StudyReport:
     Raises:
         InputError: there are no results, or a file is damaged.
     """
-    rows, ceilings = tabulate(read_results(out)), read_ceilings(out)
+    rows, ceilings = tabulate(read_results(out), published_for(out)), read_ceilings(out)
     figures = []
     if at_mixes(rows):
         figures.append(plot_bars(at_mixes(rows), out / "results.png"))

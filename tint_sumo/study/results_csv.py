@@ -64,7 +64,7 @@ def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
         conditions, time_s = row.resolved, row.navigation_time_s
         tested = (conditions.position_noise_m, conditions.tau_s, row.scene_tau_s, conditions.percent)
         p = conditions.p_conservative
-        ceiling = ceilings.get(p.low) if p.is_single else None
+        ceiling = ceilings.get(p.low) if row.conditions.is_single_mix else None  # of the scene's own traffic
         numbers: list[str] = []
         for outcome in BUILT_IN_OUTCOMES:
             numbers += (_percent(part) for part in (row.rate(outcome), *row.intervals[outcome], row.spread(outcome)))
@@ -78,7 +78,7 @@ def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
                 row.episodes,
                 " ".join(map(str, row.seeds)),
                 _percent(ceiling),
-                *(row.published.get(outcome, "") for outcome in BUILT_IN_OUTCOMES),
+                *(f"{row.published[outcome]:g}" if row.published else "" for outcome in BUILT_IN_OUTCOMES),
             ]
         )
     return text.getvalue()
@@ -116,7 +116,7 @@ def _row(line: Mapping[str, str], named_mix: Mix | None) -> StoredRow:
         rate, low, high, spread = (line[f"{outcome}{part}_percent"] for part in _PARTS)
         rates[outcome], limits[outcome] = _read_percent(rate), (_read_percent(low), _read_percent(high))
         spreads[outcome] = _read_percent(spread) if spread else None
-    time_s = line["navigation_time_s"]
+    time_s, published = line["navigation_time_s"], {outcome: line[f"paper_{outcome}_percent"] for outcome in rates}
     p, noise_m, tau_s, scene_tau_s, percent = (line[name] for name in _CONDITIONS[:-1])
     world = line.get("world") or None  # tables of earlier versions have no such column
     given_tau_s = float(tau_s) if tau_s else None
@@ -133,6 +133,7 @@ def _row(line: Mapping[str, str], named_mix: Mix | None) -> StoredRow:
         spreads,
         float(time_s) if time_s else None,
         named_mix=named_mix,
+        published={outcome: float(rate) for outcome, rate in published.items() if rate},
     )
 
 

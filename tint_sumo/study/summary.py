@@ -15,7 +15,7 @@ from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.evaluation import Evaluation
 from tint_sumo.methods.registry import METHODS, Learned, Look, look_of
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.published import RATES_PERCENT
+from tint_sumo.study.published import RATES_PERCENT, Rates
 from tint_sumo.study.results import GIVEN, Result
 
 CONDITION_TITLES = {  # what can differ from the conditions of the training
@@ -36,6 +36,7 @@ class Summary(ABC):
     seeds: tuple[int, ...]
     scene_tau_s: float  # headway of the scene's drivers
     named_mix: Mix | None = field(default=None, kw_only=True)  # that of the training, where a study has several
+    published: Mapping[str, float] = field(default_factory=dict, kw_only=True)  # the paper's rates in percent
 
     @property
     def resolved(self) -> Conditions:
@@ -73,14 +74,6 @@ class Summary(ABC):
     @property
     def title(self) -> str:
         return title_of(self.method, self.named_mix) + (" (old world)" if self.is_shipped else "")
-
-    @property
-    def published(self) -> dict[str, float]:
-        """The paper's rates in percent, empty where it has none; for the paper's conditions alone."""
-        if not self.conditions.is_single_mix:
-            return {}
-        p_conservative = self.conditions.p_conservative.low
-        return dict(zip(BUILT_IN_OUTCOMES, RATES_PERCENT.get((self.method, p_conservative), ()), strict=False))
 
 
 @dataclass(frozen=True)
@@ -140,7 +133,7 @@ class Row(Summary):
             "success_sd": self.spread("success"),
             "navigation_time_s": self.navigation_time_s,
             "collisions": self.collisions,
-            "published_percent": self.published or None,
+            "published_percent": dict(self.published) or None,
         }
 
 
@@ -159,8 +152,13 @@ def named(mixes: Iterable[Mix | None]) -> Callable[[Mix | None], Mix | None]:
 AnyRow = TypeVar("AnyRow", bound=Summary)
 
 
-def tabulate(results: Sequence[Result]) -> list[Row]:
-    """Return one row per conditions, origin, method and mix in training; methods in the registry's order."""
+def tabulate(results: Sequence[Result], published: Rates = RATES_PERCENT) -> list[Row]:
+    """Return one row per conditions, origin, method and mix in training; methods in the registry's order.
+
+    Args:
+        results: of a study.
+        published: rates of the paper, for rows at one P(conservative) in which nothing else differs.
+    """
     order = {name: position for position, name in enumerate(METHODS)}
     flat = [(result, test) for result in results for test in result.tested]
 
@@ -197,9 +195,16 @@ def tabulate(results: Sequence[Result]) -> list[Row]:
                 first.scene_tau_s,
                 evaluations,
                 named_mix=named_mix(first.mix),
+                published=_published(first.method, tested.conditions, published),
             )
         )
     return rows
+
+
+def _published(method: str, conditions: Conditions, rates: Rates) -> dict[str, float]:
+    """Return the paper's rates of a method by outcome, empty where it has none."""
+    found = rates.get((method, conditions.p_conservative.low)) if conditions.is_single_mix else None
+    return dict(zip(BUILT_IN_OUTCOMES, found, strict=True)) if found else {}
 
 
 def at_mixes(rows: Sequence[AnyRow]) -> list[AnyRow]:

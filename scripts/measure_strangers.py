@@ -97,7 +97,9 @@ def worlds_lines(table: pandas.DataFrame) -> Lines:
         cells = []
         for trained_in, method in columns:
             found = table[(table["trained_in"] == trained_in) & (table["method"] == method) & (table["world"] == world)]
-            cells.append("/".join(f"{found[f'{outcome}_percent'].mean():.0f}" for outcome in BUILT_IN_OUTCOMES))
+            cells.append(
+                "/".join(percent(found[f"{outcome}_percent"].mean() / 100, 0) for outcome in BUILT_IN_OUTCOMES)
+            )
         lines.append([f"`{world}`", *cells])
     return lines
 
@@ -126,8 +128,8 @@ def scores_lines(table: pandas.DataFrame) -> Lines:
             [
                 f"`{method}`",
                 _with_interval(interquartile_mean(scores), interquartile_interval(scores), scores),
-                ", ".join(f"{100 * score:.0f}" for score in scores.mean(axis=1)),
-                ", ".join(f"{100 * score:.1f}" for score in collisions.mean(axis=1)),
+                ", ".join(percent(score, 0) for score in scores.mean(axis=1)),
+                ", ".join(map(percent, collisions.mean(axis=1))),
                 ", ".join(str(count) for count in (collisions <= CAREFUL).sum(axis=1)),
                 above,
             ]

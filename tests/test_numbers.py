@@ -485,15 +485,16 @@ def test_the_tables_of_policies_among_strangers_are_those_of_the_results() -> No
         for (method, trained_in), cell in zip(columns, cells, strict=True):
             chosen = (measured["method"] == method) & (measured["trained_in"] == trained_in)
             found = measured[chosen & (measured["world"] == world.strip("`"))]
-            assert cell == "/".join(f"{found[f'{outcome}_percent'].mean():.0f}" for outcome in BUILT_IN_OUTCOMES)
+            means = (found[f"{outcome}_percent"].mean() / 100 for outcome in BUILT_IN_OUTCOMES)
+            assert cell == "/".join(percent(mean, 0) for mean in means)
     trained = measured[measured["trained_in"] == "strangers"]
     for line in scores.strip().split("\n")[2:]:
         method, middle, success, collisions, careful, _ = line.strip("| ").split(" | ")
         found = trained[trained["method"] == method.strip("`")]
         assert float(middle.split()[0]) == pytest.approx(trim_mean(found["success_percent"], 0.25), abs=0.51)
         seeds = [rows for _, rows in found.groupby("seed")]
-        assert success == ", ".join(f"{rows['success_percent'].mean():.0f}" for rows in seeds)
-        assert collisions == ", ".join(f"{rows['collision_percent'].mean():.1f}" for rows in seeds)
+        assert success == ", ".join(percent(rows["success_percent"].mean() / 100, 0) for rows in seeds)
+        assert collisions == ", ".join(percent(rows["collision_percent"].mean() / 100) for rows in seeds)
         assert careful == ", ".join(str((rows["collision_percent"] <= 1.0).sum()) for rows in seeds)
 
 

@@ -225,6 +225,11 @@ def test_worlds_are_rows_with_all_outcomes_of_each_method(report: StudyReport) -
     ]
 
 
+def test_no_share_of_a_world_below_all_reads_100() -> None:
+    rows = tabulate([given("ttc", {IN_WORLDS[0]: (299, 0, 1)})])
+    assert tables(to_markdown(result_tables(rows, {})))["Worlds"][1] == ["the old world", ">99/0/<1"]
+
+
 def test_a_table_of_earlier_versions_knows_no_worlds(report: StudyReport, tmp_path: Path) -> None:
     lines = [line for line in csv.DictReader(report.csv_file.read_text().splitlines()) if not line["world"]]
     with (tmp_path / "old.csv").open("w", newline="") as file:

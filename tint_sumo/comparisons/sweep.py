@@ -20,6 +20,7 @@ from tint_sumo.config import (
 )
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import claim_folder, write_text
+from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Report
 from tint_sumo.core.ranges import require_distinct
 from tint_sumo.core.structures import overlay, plain, require_fields
@@ -255,13 +256,13 @@ def _lines(table: pd.DataFrame) -> Lines:
     lines = [["settings", "method", *(f"P {p:g}" for p in mixes), "mean"]]
     for (variant, method), rows in found:
         cells = [_with_spread(rows.loc[rows["p_conservative"] == p, "success"]) for p in mixes]
-        lines.append([str(variant), str(method), *cells, f"{100 * rows['success'].mean():.1f}"])
+        lines.append([str(variant), str(method), *cells, percent(rows["success"].mean())])
     return lines
 
 
 def _with_spread(shares: "pd.Series[float]") -> str:
     spread = f" ± {100 * shares.std(ddof=1):.1f}" if len(shares) > 1 else ""
-    return f"{100 * shares.mean():.1f}{spread}"
+    return f"{percent(shares.mean())}{spread}"
 
 
 def _require_traits(methods: Sequence[Learned], scene: Scene) -> None:

@@ -225,7 +225,7 @@ def _world_lines(rows: Sequence[Summary]) -> Lines:
     lines = [["world", *titles]]
     for conditions, name in labels(rows).items():
         found = [row for row in rows if row.conditions == conditions]
-        at = {row.title: "/".join(f"{100 * row.rate(outcome):.0f}" for outcome in BUILT_IN_OUTCOMES) for row in found}
+        at = {row.title: "/".join(percent(row.rate(outcome), 0) for outcome in BUILT_IN_OUTCOMES) for row in found}
         lines.append([name, *(at.get(title, "-") for title in titles)])
     return lines
 

@@ -74,6 +74,20 @@ def test_the_same_conditions_twice_are_refused(trials: tuple[Trials, ...], budge
         plan(replace(budget, trials=trials), tmp_path)
 
 
+def test_a_mix_in_training_that_no_test_meets_is_refused(budget: Budget, tmp_path: Path) -> None:
+    untested = replace(budget, mixes=(Mix(0.4), Mix(0.5)))
+    with pytest.raises(InputError, match=r"policies trained at 0\.5 are tested nowhere"):
+        plan(untested, tmp_path)
+    assert plan(replace(untested, methods=("always_go",)), tmp_path), "rules are trained at no mix"
+
+
+def test_methods_without_a_trait_model_are_studied_in_any_scene(budget: Budget, tmp_path: Path) -> None:
+    shipped = replace(budget, traits=None, windows=0, methods=("ttc", "no_labels", "oracle"))
+    assert plan(shipped, tmp_path, find_scene("roundabout"))
+    with pytest.raises(InputError, match=r"^ma: the shipped trait models know .*, not roundabout; give the"):
+        plan(replace(shipped, methods=("ma", "oracle")), tmp_path, find_scene("roundabout"))
+
+
 @pytest.mark.slow
 def test_a_study_leaves_everything_it_made(finished: Path) -> None:
     made = {str(path.relative_to(finished)) for path in finished.rglob("*")}

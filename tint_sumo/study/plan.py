@@ -1,8 +1,10 @@
 """The whole study: record, learn traits, train and test every policy, report."""
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
+from tint_sumo.config import Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import claim_folder
 from tint_sumo.core.structures import plain
@@ -36,7 +38,11 @@ def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
     encoders = dict.fromkeys(filter(None, (find_learned(name).encoder for name in trained)))
     traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
     given = rules + (shipped_policies() if budget.with_shipped and base == paper_scene() else [])
+    if budget.traits is None:
+        remedy = "give the budget traits, and windows to learn them from, as the budget quick has"
+        require_traits(learned, scene, remedy)
     trials = _trials_in(scene, budget)
+    _require_tests(budget.mixes if learned else (), trials)
     jobs: list[Job] = [*traits]
     for seed in budget.seeds:
         trainings = [
@@ -67,6 +73,17 @@ def _trials_in(scene: Scene, budget: Budget) -> tuple[Trials, ...]:
     return trials
 
 
+def _require_tests(mixes: Sequence[Mix], trials: Sequence[Trials]) -> None:
+    """Raise InputError unless policies that are trained at each of the mixes are tested somewhere."""
+    tested = [conditions.p_conservative for one in trials for conditions in one.conditions]
+    for mix in mixes:
+        if not any(map(mix.contains, tested)):
+            raise InputError(
+                f"mixes: policies trained at {mix.text} are tested nowhere; give trials with p_conservative "
+                f"{mix.text}, or leave this mix out"
+            )
+
+
 def run_study(
     budget: Budget, out: Path, *, scene: str | Scene = T_INTERSECTION, workers: Workers = 2, progress: bool = True
 ) -> StudyReport:
@@ -86,7 +103,6 @@ def run_study(
     executor = executor_of(workers)
     base = require_scene("a study", find_scene(scene))
     found = budget.trained_in(base)
-    _require_traits(budget, found)
     jobs = plan(budget, out, base)
     scene_entries = {} if found == paper_scene() else described([found])
     with claim_folder(out, {"kind": "study", **plain(budget), **scene_entries}):
@@ -115,10 +131,11 @@ def require_scene(work: str, scene: AnyScene) -> Scene:
     return found
 
 
-def _require_traits(budget: Budget, scene: Scene) -> None:
-    """Raise InputError unless the study has trait models for the scene."""
-    if budget.traits is None and scene.digest != paper_scene().digest:
+def require_traits(methods: Sequence[str], scene: Scene, remedy: str) -> None:
+    """Raise InputError, which ends with a remedy, if a method takes a shipped trait model that is not of the scene."""
+    inferring = [name for name in methods if find_learned(name).encoder]
+    if inferring and scene.digest != paper_scene().digest:
         raise InputError(
-            f"the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; give the budget traits, and "
-            "windows to learn them from, as the budget quick has"
+            f"{', '.join(inferring)}: the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; "
+            f"{remedy}"
         )

@@ -45,7 +45,7 @@ from tint_sumo.study.figures import plot_bars, plot_conditions, plot_worlds
 from tint_sumo.study.jobs import label
 from tint_sumo.study.results import GIVEN, TRAINED, read_results
 from tint_sumo.study.results_csv import StoredRow, read_csv
-from tint_sumo.study.summary import at_mixes, over_all_mixes, tabulate
+from tint_sumo.study.summary import at_mixes, in_other_conditions, tabulate
 from tint_sumo.traits.datasets import evaluate_traits
 from tint_sumo.traits.storage import add_to_card
 
@@ -127,7 +127,7 @@ def make_figures(images: Path) -> None:
     """Draw the figures of the navigation study and of the comparison of trait methods, from their shipped tables."""
     rows, _ = read_csv(DATA / "results" / "navigation.csv")
     plot_bars(at_mixes(rows), images / "navigation.png")
-    plot_conditions(over_all_mixes(rows), images / "conditions.png")
+    plot_conditions(in_other_conditions(rows), images / "conditions.png")
     plot_noise(pandas.read_csv(DATA / "results" / "traits.csv"), images / "traits.png")
     plot_worlds(rows_of_strangers(), images / "strangers.png")
 

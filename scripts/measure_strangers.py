@@ -129,8 +129,8 @@ def scores_lines(table: pandas.DataFrame) -> Lines:
             [
                 f"`{method}`",
                 _with_interval(interquartile_mean(scores), interquartile_interval(scores), scores),
-                ", ".join(f"{100 * score:.0f}" for score in scores.mean(axis=1)),
-                ", ".join(f"{100 * score:.1f}" for score in collisions.mean(axis=1)),
+                ", ".join(percent(score, 0) for score in scores.mean(axis=1)),
+                ", ".join(map(percent, collisions.mean(axis=1))),
                 ", ".join(str(count) for count in (collisions <= CAREFUL).sum(axis=1)),
                 above,
             ]

@@ -19,7 +19,7 @@ from tint_sumo.drivers.prediction import ERRORS
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.registry import find_learned, learned_methods
 from tint_sumo.study.results_csv import read_csv
-from tint_sumo.study.summary import Summary, at_mixes, by_title, over_all_mixes
+from tint_sumo.study.summary import Summary, at_mixes, by_title, in_other_conditions
 from tint_sumo.traits.identification import (
     AMONG_RUN,
     CHANCE,
@@ -65,7 +65,7 @@ def test_the_tables_of_the_study_say_what_the_csv_file_says() -> None:
         rates = [re.escape(percent(row.rate(outcome))) + r" \[[^]]+\]" for outcome in BUILT_IN_OUTCOMES]
         line = " \\| ".join([f"{_mix(row):g}", re.escape(row.title), *rates])
         assert re.search(rf"^\| {line} \|", text, re.MULTILINE), line
-    for title, own in by_title(over_all_mixes(rows)).items():
+    for title, own in by_title(in_other_conditions(rows)).items():
         cells = [f"{percent(row.rate('success'))} ({percent(row.rate('collision'))})" for row in own]
         (line,) = [line for line in text.split("## ")[-1].splitlines() if line.startswith(f"| {title} |")]
         assert [cell for cell in line.strip("| ").split(" | ")[1:] if cell != "-"] == cells
@@ -354,7 +354,7 @@ def _summaries(**conditions: float) -> dict[str, float]:
     wanted = {"position_noise_m": 0.0, "tau_s": 1.0, "percent": 100, **conditions}
     return {
         row.method: 100.0 * row.rate("success")
-        for row in over_all_mixes(rows)
+        for row in in_other_conditions(rows)
         if all(getattr(row.resolved, name) == value for name, value in wanted.items())
     }
 
@@ -493,8 +493,8 @@ def test_the_tables_of_policies_among_strangers_are_those_of_the_results() -> No
         found = trained[trained["method"] == method.strip("`")]
         assert float(middle.split()[0]) == pytest.approx(trim_mean(found["success_percent"], 0.25), abs=0.51)
         seeds = [rows for _, rows in found.groupby("seed")]
-        assert success == ", ".join(f"{rows['success_percent'].mean():.0f}" for rows in seeds)
-        assert collisions == ", ".join(f"{rows['collision_percent'].mean():.1f}" for rows in seeds)
+        assert success == ", ".join(percent(rows["success_percent"].mean() / 100, 0) for rows in seeds)
+        assert collisions == ", ".join(percent(rows["collision_percent"].mean() / 100) for rows in seeds)
         assert careful == ", ".join(str((rows["collision_percent"] <= 1.0).sum()) for rows in seeds)
 
 

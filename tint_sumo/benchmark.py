@@ -20,6 +20,7 @@ from tint_sumo.config import ALL_MIXES, HELD_OUT_WORLDS, P_CONSERVATIVE, PPO_BUD
 from tint_sumo.core.determinism import single_threaded
 from tint_sumo.core.errors import InputError, find_named, shown
 from tint_sumo.core.files import write_frame
+from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Report, silent
 from tint_sumo.core.statistics import Rate
 from tint_sumo.envs import TaskSettings
@@ -254,11 +255,11 @@ def leaderboard_markdown(entries: Sequence[Entry], suite: str) -> str:
         if one.suite == suite:
             by_name.setdefault(one.name, []).append(one)
     for name, found in by_name.items():
-        shares = [100.0 * float(np.mean([one.rate(outcome).value for one in found])) for outcome in BUILT_IN_OUTCOMES]
+        shares = [float(np.mean([one.rate(outcome).value for one in found])) for outcome in BUILT_IN_OUTCOMES]
         worst = min(found, key=lambda one: one.rate("success").value)
         cases = sum(len(one.outcomes) for one in found)
         label = f"[{name}]({found[0].url})" if found[0].url else name
-        least = f"{100.0 * worst.rate('success').value:.0f} ({worst.world})"
-        rows.append((shares[0], f"| {label} | {' | '.join(f'{share:.1f}' for share in shares)} | {least} | {cases} |"))
+        least = f"{percent(worst.rate('success').value, 0)} ({worst.world})"
+        rows.append((shares[0], f"| {label} | {' | '.join(map(percent, shares))} | {least} | {cases} |"))
     head = f"| policy | {' | '.join(f'{outcome} %' for outcome in BUILT_IN_OUTCOMES)} | least success % | cases |"
     return "\n".join([head, "| --- | --: | --: | --: | --- | --: |", *(text for _, text in sorted(rows, reverse=True))])

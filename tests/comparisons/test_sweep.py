@@ -230,5 +230,7 @@ def test_the_best_line_of_the_table_comes_first() -> None:
         "| n_epochs=4 | ma     | 25.0 ± 35.4 | 75.0 ± 0.0  | 50.0 |",
     ]
     assert note.startswith("Success in percent of 20 cases")
+    nearly = report_markdown(table.assign(success=0.9999), 20)
+    assert "| >99.9 ± 0.0 | >99.9 ± 0.0 | >99.9 |" in nearly
     one_seed = report_markdown(table[table["seed"] == 1], 20)
     assert "| n_epochs=4 | ma     | 50.0   | 75.0  | 62.5 |" in one_seed

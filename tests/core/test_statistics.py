@@ -73,6 +73,14 @@ def test_what_always_or_never_happens_has_an_interval_of_no_width(always: bool) 
     assert rate_interval(np.full((3, 50), always)) == (float(always), float(always))
 
 
+def test_the_only_case_has_an_interval_over_the_seeds() -> None:
+    hits = np.array([[True], [False], [True]])
+    low, high = rate_interval(hits)
+    assert 0.0 <= low < 2 / 3 < high <= 1.0
+    assert difference_interval(hits, hits)[0] < 0.0 < difference_interval(hits, hits)[1]
+    assert rate_interval(np.ones((2, 1), bool)) == (1.0, 1.0)
+
+
 def test_intervals_are_the_same_every_time() -> None:
     some, other = hits(0.6, 0.8, 0.9), hits(0.7, 0.7, seed=1)
     assert rate_interval(some) == rate_interval(some.copy())

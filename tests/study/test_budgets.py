@@ -24,7 +24,7 @@ from tint_sumo.envs import TaskSettings
 from tint_sumo.methods.registry import Learned, find_method
 from tint_sumo.methods.training import SNAPSHOTS_PERCENT
 from tint_sumo.scenes import find_scene
-from tint_sumo.study.budgets import BUDGETS, Conditions
+from tint_sumo.study.budgets import BUDGETS, Conditions, Trials
 
 
 @pytest.mark.parametrize("name", BUDGETS)
@@ -141,3 +141,10 @@ def test_a_world_is_the_drivers_and_the_sensor_of_a_test() -> None:
             Conditions(ALL_MIXES, **unfit)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="mars"):
         replace(BUDGETS["full"], world="mars")
+
+
+def test_a_budget_without_tests_is_refused() -> None:
+    with pytest.raises(InputError, match="trials must be one or more"):
+        replace(BUDGETS["quick"], trials=())
+    with pytest.raises(InputError, match="conditions must be one or more"):
+        Trials((), 100)

@@ -16,7 +16,7 @@ from tint_sumo.methods.registry import METHODS
 from tint_sumo.study import figures
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_profiles, plot_worlds
-from tint_sumo.study.summary import at_mixes, in_worlds, over_all_mixes, tabulate
+from tint_sumo.study.summary import at_mixes, in_other_conditions, in_worlds, tabulate
 
 AS_TRAINED = Conditions(ALL_MIXES)
 OTHERS = (
@@ -97,7 +97,7 @@ def test_a_single_bar_is_a_figure_too(tmp_path: Path) -> None:
 
 
 def test_curves_are_means_over_seeds(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
-    curves = {"oracle": [curve(0.2, 0.4), curve(0.4, 0.8)], "ma": [curve(0.1, 0.1)]}
+    curves = {("oracle", ALL_MIXES): [curve(0.2, 0.4), curve(0.4, 0.8)], ("ma", ALL_MIXES): [curve(0.1, 0.1)]}
     assert_picture(plot_curves(curves, tmp_path / "curves.png"))
     axes = drawn().axes[0]
     oracle, ma = axes.get_lines()
@@ -107,23 +107,34 @@ def test_curves_are_means_over_seeds(tmp_path: Path, drawn: Callable[[], Figure]
 
 
 def test_seeds_are_compared_as_far_as_all_of_them_have_come(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
-    curves = {"oracle": [curve(0.2, 0.2, 0.2), curve(0.4)]}
+    curves = {("oracle", ALL_MIXES): [curve(0.2, 0.2, 0.2), curve(0.4)]}
     assert_picture(plot_curves(curves, tmp_path / "curves.png"))
     np.testing.assert_allclose(drawn().axes[0].get_lines()[0].get_ydata(), [30.0])
 
 
 def test_every_method_has_a_curve_of_its_own_look(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
-    curves = {name: [curve(0.2, 0.4)] for name in METHODS}
+    curves = {(name, ALL_MIXES): [curve(0.2, 0.4)] for name in METHODS}
     assert_picture(plot_curves(curves, tmp_path / "curves.png"))
     lines = drawn().axes[0].get_lines()
     looks = [(line.get_color(), line.get_marker(), line.get_linestyle()) for line in lines]
     assert looks == [(one.look.colour, one.look.marker, one.look.dash) for one in METHODS.values()]
 
 
+def test_trainings_at_several_mixes_have_curves_of_their_own(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
+    curves = {("oracle", Mix(0.25)): [curve(0.2)], ("oracle", Mix(0.4)): [curve(0.4), curve(0.6)]}
+    assert_picture(plot_curves(curves, tmp_path / "curves.png"))
+    axes = drawn().axes[0]
+    first, second = axes.get_lines()
+    assert [first.get_label(), second.get_label()] == ["oracle (trained at P 0.25)", "oracle (trained at P 0.4)"]
+    assert [list(first.get_ydata()), list(second.get_ydata())] == [[20.0], [50.0]]
+    assert first.get_color() == second.get_color() and first.get_marker() != second.get_marker()
+    assert axes.get_ylabel() == "success in training (%)"
+
+
 def test_each_condition_has_a_panel_through_the_training_s_conditions(
     tmp_path: Path, drawn: Callable[[], Figure]
 ) -> None:
-    assert_picture(plot_conditions(over_all_mixes(ROWS), tmp_path / "conditions.png"))
+    assert_picture(plot_conditions(in_other_conditions(ROWS), tmp_path / "conditions.png"))
     noise, tau, percent = drawn().axes
     shown = [[list(container.lines[0].get_xdata()) for container in axes.containers] for axes in (noise, tau, percent)]
     assert shown[0] == [[0.0, 0.05, 0.1]] * 2
@@ -136,7 +147,7 @@ def test_each_condition_has_a_panel_through_the_training_s_conditions(
 
 def test_methods_of_the_past_are_drawn_under_their_names(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
     rows = tabulate([trained("forgotten", 0, {AS_TRAINED: (1, 1, 0), Conditions(Mix(0.4)): (1, 1, 0)})])
-    assert_picture(plot_conditions(over_all_mixes(rows), tmp_path / "conditions.png"))
+    assert_picture(plot_conditions(in_other_conditions(rows), tmp_path / "conditions.png"))
     assert [container.get_label() for container in drawn().axes[0].containers] == ["forgotten"]
     plot_bars(at_mixes(rows), tmp_path / "bars.png")
     assert drawn().axes[0].get_yticklabels()[0].get_text() == "forgotten"
@@ -156,9 +167,11 @@ def test_worlds_have_a_line_each_and_methods_a_marker(tmp_path: Path, drawn: Cal
 
 
 def test_profiles_fall_from_all_trainings_to_none(tmp_path: Path, drawn: Callable[[], Figure]) -> None:
-    found = {"oracle": np.array([[0.9, 0.8], [0.9, 0.2]]), "no labels": np.array([[0.5, 0.5]])}
+    found = {"oracle": np.array([[0.9, 0.8], [0.9, 0.2]]), "own": np.array([[0.5, 0.5]])}
     assert_picture(plot_profiles(found, tmp_path / "profiles.png"))
-    oracle, other = (line.get_xydata() for line in drawn().axes[0].get_lines())
+    lines = drawn().axes[0].get_lines()
+    assert [line.get_label() for line in lines] == ["oracle", "own"], "a method that nobody has registered has a line"
+    oracle, other = (line.get_xydata() for line in lines)
     at = {round(float(success)): share for success, share in oracle.tolist()}
     assert [at[success] for success in (0, 30, 85, 95)] == [100.0, 75.0, 50.0, 0.0]
     assert other[0, 1] == 100.0 and other[-1, 1] == 0.0

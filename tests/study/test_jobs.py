@@ -187,23 +187,27 @@ def test_a_result_is_a_file_that_says_what_was_tested(study: Path) -> None:
     assert len(content["tested"][0]["cases"]) == 2
 
 
-def test_curves_are_found_by_method(tmp_path: Path) -> None:
+def test_curves_are_found_by_method_and_mix(tmp_path: Path) -> None:
     for name, success in (
         ("streaming-P0.1to0.9-seed0", 0.5),
         ("streaming-P0.1to0.9-seed1", 0.6),
+        ("streaming-P0.4-seed0", 0.8),
         ("streaming_critic-P0.1to0.9-seed0", 0.7),
         ("no_labels-P0.1to0.9-seed0", 0.4),
     ):
         write_text(tmp_path / "policies" / name / CURVE_FILE, f"{HEADER}64,{success},0.1,0.1\n")
     write_text(tmp_path / "policies" / "oracle-P0.1to0.9-seed0" / CURVE_FILE, HEADER)  # no episode has ended yet
     (tmp_path / "policies" / "ma-P0.1to0.9-seed0").mkdir()  # it shares another one's training
+    write_text(tmp_path / "policies" / "oracle-P0.4-seed0-old" / CURVE_FILE, "a copy by hand")
     curves = read_curves(tmp_path)
-    assert {name: [curve["success"].tolist() for curve in seeds] for name, seeds in curves.items()} == {
-        "no_labels": [[0.4]],
-        "streaming": [[0.5], [0.6]],
-        "streaming_critic": [[0.7]],
+    assert {training: [curve["success"].tolist() for curve in seeds] for training, seeds in curves.items()} == {
+        ("no_labels", ALL_MIXES): [[0.4]],
+        ("streaming", ALL_MIXES): [[0.5], [0.6]],
+        ("streaming", Mix(0.4)): [[0.8]],
+        ("streaming_critic", ALL_MIXES): [[0.7]],
     }
-    assert list(curves) == [name for name in METHODS if name in curves]
+    names = list(dict.fromkeys(name for name, _ in curves))
+    assert names == [name for name in METHODS if name in names]
 
 
 def test_a_study_without_trainings_has_no_curves(tmp_path: Path) -> None:
@@ -211,7 +215,7 @@ def test_a_study_without_trainings_has_no_curves(tmp_path: Path) -> None:
 
 
 def test_the_curve_of_a_training_is_one_of_the_study(study: Path) -> None:
-    (curve,) = read_curves(study)["oracle"]
+    (curve,) = read_curves(study)["oracle", Mix(0.4)]
     pd.testing.assert_frame_equal(
         curve, pd.DataFrame({"decisions": [64.0, 128.0], "success": 0.0, "timeout": 1.0, "collision": 0.0})
     )

@@ -82,8 +82,8 @@ def test_the_middle_mix_that_most_policies_met_is_shown_with_first_seeds() -> No
     choice = choose(rows)
     assert choice.conditions == Conditions(Mix(0.4))
     assert [one.label for one in choice.policies] == ["ttc", "oracle-shipped", "oracle-P0.1to0.9-seed3"]
-    only_others = choose(tabulate([given("ttc", {Conditions(ALL_MIXES, 0.1): counts})]))
-    assert only_others.conditions == Conditions(ALL_MIXES, 0.1)
+    for other in (Conditions(ALL_MIXES, 0.1), Conditions(Mix(0.4), 0.1), Conditions(Mix(0.4), world="towns")):
+        assert choose(tabulate([given("ttc", {other: counts})])).conditions == other
 
 
 # Recordings
@@ -190,6 +190,12 @@ def test_recordings_tell_the_case_and_are_made_once_for_a_policy_and_its_cases(t
     recording.file.unlink()
     recording.make(silent)
     assert recording.file.read_bytes() == written
+
+
+def test_a_part_of_a_training_is_recorded_with_the_policy_of_that_time(tmp_path: Path) -> None:
+    half = Conditions(Mix(0.4), percent=50)
+    with pytest.raises(InputError, match=r"policy-50"):
+        Recording("oracle", Mix(0.4), 0, half, (0,), tmp_path).require_policy()
 
 
 def test_damaged_recordings_are_named_in_one_line(tmp_path: Path) -> None:

@@ -62,6 +62,32 @@ def test_a_headway_that_is_the_scene_s_is_planned_like_one_that_is_not_given(tmp
     assert tests and all(job.trials == planned for job in tests)
 
 
+@pytest.mark.parametrize(
+    "trials",
+    [
+        (Trials((AT_MIX, Conditions(Mix(0.4), tau_s=Idm.tau_s)), 3),),  # the headway is the scene's
+        (Trials((AT_MIX,), 3), Trials((AT_MIX,), 5)),
+    ],
+)
+def test_the_same_conditions_twice_are_refused(trials: tuple[Trials, ...], budget: Budget, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"each conditions once, not P\(conservative\) 0\.4 as trained 2 times"):
+        plan(replace(budget, trials=trials), tmp_path)
+
+
+def test_a_mix_in_training_that_no_test_meets_is_refused(budget: Budget, tmp_path: Path) -> None:
+    untested = replace(budget, mixes=(Mix(0.4), Mix(0.5)))
+    with pytest.raises(InputError, match=r"policies trained at 0\.5 are tested nowhere"):
+        plan(untested, tmp_path)
+    assert plan(replace(untested, methods=("always_go",)), tmp_path), "rules are trained at no mix"
+
+
+def test_methods_without_a_trait_model_are_studied_in_any_scene(budget: Budget, tmp_path: Path) -> None:
+    shipped = replace(budget, traits=None, windows=0, methods=("ttc", "no_labels", "oracle"))
+    assert plan(shipped, tmp_path, find_scene("roundabout"))
+    with pytest.raises(InputError, match=r"^ma: the shipped trait models know .*, not roundabout; give the"):
+        plan(replace(shipped, methods=("ma", "oracle")), tmp_path, find_scene("roundabout"))
+
+
 @pytest.mark.slow
 def test_a_study_leaves_everything_it_made(finished: Path) -> None:
     made = {str(path.relative_to(finished)) for path in finished.rglob("*")}
@@ -78,6 +104,7 @@ def test_a_study_leaves_everything_it_made(finished: Path) -> None:
         "results.csv",
         "results.md",
         "results.png",
+        "conditions.png",
         "curves.png",
     }
     assert not [path for path in made if path.endswith((".partial", ".zip", ".pt", ".pkl"))]
@@ -112,7 +139,7 @@ def test_only_what_is_missing_is_made_again(budget: Budget, finished: Path) -> N
     assert lost.read_text() == content
     assert {row.method for row in report.rows} == {"always_go", "ma", "oracle"}
     changed = {path for path, time in times(finished).items() if before.get(path) != time}
-    written = {"results.csv", "results.md", "results.png", "curves.png", "report.html"}
+    written = {"results.csv", "results.md", "results.png", "conditions.png", "curves.png", "report.html"}
     assert changed == {"results/always_go.json", *written}
 
 

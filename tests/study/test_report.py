@@ -1,5 +1,6 @@
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,11 +9,13 @@ from PIL import Image
 from tests.study.scenes import given, trained, write_results
 from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.files import write_json, write_text
+from tint_sumo.core.files import RUN_FILE, write_json, write_text
 from tint_sumo.core.statistics import Rate, difference_interval, interquartile_mean, rate_interval
 from tint_sumo.methods.training import CURVE_FILE
+from tint_sumo.scenes import described, find_scene
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE
+from tint_sumo.study.page.findings import what_came_out
 from tint_sumo.study.report import StudyReport, result_tables, to_markdown, write_report
 from tint_sumo.study.results import Result
 from tint_sumo.study.results_csv import read_csv, to_csv
@@ -161,6 +164,32 @@ def test_csv_values_of_one_seed() -> None:
     assert (half["position_noise_m"], half["tau_s"], half["success_percent"]) == ("0", "1", "70.00")
 
 
+def test_the_ceiling_stands_beside_the_traffic_that_it_was_computed_for() -> None:
+    other = (Conditions(Mix(0.4), tau_s=1.5), Conditions(Mix(0.4), 0.1), Conditions(Mix(0.4), world="towns"))
+    rows = tabulate([given("ttc", dict.fromkeys((Conditions(Mix(0.4)), *other), (1, 0, 0)))])
+    lines = csv.DictReader(to_csv(rows, {0.4: 0.995}).splitlines())
+    assert [line["ceiling_percent"] for line in lines] == ["99.50", "", "", ""]
+
+
+@pytest.mark.parametrize(
+    ("settings", "paper"),
+    [
+        ({"kind": "study"}, "90"),
+        ({"kind": "study", "world": "old"}, "90"),
+        ({"kind": "study", "world": "range_15"}, ""),
+        ({"kind": "study", **described([find_scene("roundabout")])}, ""),
+    ],
+)
+def test_the_paper_s_rates_stand_beside_studies_of_its_scene_and_sensor(
+    settings: dict[str, Any], paper: str, tmp_path: Path
+) -> None:
+    write_json(tmp_path / RUN_FILE, settings)
+    report = write_report(write_results([trained("oracle", 0, {Conditions(Mix(0.4)): (1, 0, 0)})], tmp_path))
+    (line,) = csv.DictReader(report.csv_file.read_text().splitlines())
+    assert line["paper_success_percent"] == paper
+    assert read_csv(report.csv_file)[0][0].published == report.rows[0].published
+
+
 def test_every_table_of_several_seeds_is_there(report: StudyReport) -> None:
     assert list(tables(report.markdown)) == [
         "Success by mix of drivers",
@@ -194,6 +223,11 @@ def test_worlds_are_rows_with_all_outcomes_of_each_method(report: StudyReport) -
         ["the old world", "35/5/60", "68/5/27", "93/5/2"],
         ["headway 1.5 s", "10/30/60", "43/30/27", "68/30/2"],
     ]
+
+
+def test_no_share_of_a_world_below_all_reads_100() -> None:
+    rows = tabulate([given("ttc", {IN_WORLDS[0]: (299, 0, 1)})])
+    assert tables(to_markdown(result_tables(rows, {})))["Worlds"][1] == ["the old world", ">99/0/<1"]
 
 
 def test_a_table_of_earlier_versions_knows_no_worlds(report: StudyReport, tmp_path: Path) -> None:
@@ -261,6 +295,35 @@ def test_methods_that_did_not_meet_the_same_cases_are_not_compared() -> None:
     assert line == ["paper's method", "oracle", "-", "-"]
 
 
+def test_policies_that_were_trained_at_several_mixes_are_told_apart(tmp_path: Path) -> None:
+    at, noisy, world = Conditions(Mix(0.4)), Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, world="towns")
+    successes = {("oracle", ALL_MIXES): 8, ("oracle", Mix(0.4)): 2, ("no_labels", ALL_MIXES): 5}
+    results = [
+        trained(method, seed, dict.fromkeys((at, noisy, world), (n, 10 - n, 0)), mix)
+        for (method, mix), n in successes.items()
+        for seed in range(2)
+    ]
+    rows = tabulate(results)
+    found = tables(to_markdown(result_tables(rows, {})))
+    no_labels = "no labels (trained at P 0.1 to 0.9)"
+    oracle, oracle_at = "oracle (trained at P 0.1 to 0.9)", "oracle (trained at P 0.4)"
+    assert [[line[0], line[2]] for line in found["Success by mix of drivers"][1:]] == [
+        [no_labels, "50.0 ± 0.0"],
+        [oracle, "80.0 ± 0.0"],
+        [oracle_at, "20.0 ± 0.0"],
+    ]
+    assert [[*line[:2], line[2].split()[0]] for line in found["Differences in success"][1:]] == [
+        [no_labels, oracle, "-30.0"],
+        [oracle, no_labels, "+30.0"],
+    ]
+    assert [line[0] for line in found["Other conditions and shorter trainings"]][1:] == [no_labels, oracle, oracle_at]
+    assert found["Worlds"] == [["world", no_labels, oracle, oracle_at], ["128 towns", "50/50/0", "80/20/0", "20/80/0"]]
+    write_text(tmp_path / "results.csv", to_csv(rows, {}))
+    assert [row.title for row in read_csv(tmp_path / "results.csv")[0]] == [row.title for row in rows]
+    assert [row.to_json()["trained_p_conservative"] for row in rows[:3]] == [[0.1, 0.9], [0.1, 0.9], 0.4]
+    assert what_came_out(rows).startswith("At P 0.4 all 2 methods succeeded in 50.0 % of the cases")
+
+
 def test_other_conditions_stand_beside_those_of_the_training(report: StudyReport) -> None:
     assert tables(report.markdown)["Other conditions and shorter trainings"] == [
         ["method", "as trained", "noise 0.1 m", "50 % of training"],
@@ -269,6 +332,33 @@ def test_other_conditions_stand_beside_those_of_the_training(report: StudyReport
         ["paper's method", "63.3 (31.7)", "53.3 (41.7)", "48.3 (46.7)"],
         ["oracle", "88.3 (6.7)", "78.3 (16.7)", "73.3 (21.7)"],
     ]
+
+
+def test_conditions_at_several_mixes_are_columns_and_rows_of_their_own() -> None:
+    slow = [Conditions(Mix(p), tau_s=1.5) for p in (0.4, 0.6)]
+    worlds = [Conditions(Mix(0.4), world="towns"), Conditions(ALL_MIXES, percent=50, world="towns")]
+    rows = tabulate([trained("oracle", 0, {conditions: (n, 0, 4 - n) for n, conditions in enumerate(slow + worlds)})])
+    markdown = to_markdown(result_tables(rows, {}))
+    assert tables(markdown) == {
+        "Other conditions and shorter trainings": [
+            ["method", "headway 1.5 s, P 0.4", "headway 1.5 s, P 0.6"],
+            ["oracle", "0.0 (100.0)", "25.0 (75.0)"],
+        ],
+        "Worlds": [
+            ["world", "oracle"],
+            ["128 towns, P 0.4", "50/0/50"],
+            ["128 towns, 50 % of training, P 0.1 to 0.9", "75/0/25"],
+        ],
+    }
+    assert markdown.count("P is P(conservative) of the cases") == 2
+    alone = to_markdown(result_tables(rows[:1], {}))
+    assert "Success (collision) in percent; P(conservative) is 0.4." in alone
+
+
+def test_a_study_in_other_conditions_at_one_mix_has_figures(tmp_path: Path) -> None:
+    tested = dict.fromkeys((Conditions(Mix(0.4), tau_s=1.5), Conditions(Mix(0.4), world="towns")), (2, 1, 1))
+    report = write_report(write_results([trained("oracle", 0, tested)], tmp_path))
+    assert [file.name for file in report.figure_files] == ["conditions.png", "worlds.png"]
 
 
 def test_a_study_with_one_seed_and_no_curves_has_no_differences(tmp_path: Path) -> None:

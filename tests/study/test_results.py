@@ -63,7 +63,8 @@ def test_a_file_without_the_scene_s_headway_is_of_drivers_with_the_default_one(s
 
 def test_a_policy_that_no_test_is_for_has_no_cases(tmp_path: Path) -> None:
     untested = trained("oracle", 0, {}, mix=Mix(0.25))
-    assert read_results(write_results([untested], tmp_path)) == [untested]
+    results = [untested, *SOME_RESULTS]
+    assert read_results(write_results(results, tmp_path)) == results
 
 
 def test_results_of_a_sweep_are_no_study_s(tmp_path: Path) -> None:
@@ -136,3 +137,9 @@ def damage(study: Path, text: str) -> None:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"result of a study: no file .*gone\.json"):
         Result.read(tmp_path / "gone.json")
+
+
+def test_results_without_a_test_are_refused(tmp_path: Path) -> None:
+    write_results([trained("oracle", 0, {})], tmp_path)
+    with pytest.raises(InputError, match=r"no policy of .* was tested"):
+        read_results(tmp_path)

@@ -25,8 +25,8 @@ from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.ceiling_job import CEILINGS_FILE, read_ceilings
 from tint_sumo.study.folders import RESULTS
 from tint_sumo.study.page.recording import Recording, read_episodes
-from tint_sumo.study.page.writing import read_scene_of
 from tint_sumo.study.results import Result
+from tint_sumo.study.settings import read_scene_of
 from tint_sumo.traits.evaluation import Part, TraitAccuracy
 from tint_sumo.traits.storage import add_to_card, require_scene
 

@@ -8,9 +8,20 @@ from tests.study.scenes import given, trained
 from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.statistics import Rate, rate_interval
 from tint_sumo.methods.evaluation import Case, Evaluation
+from tint_sumo.methods.registry import METHODS
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.results import TRAINED
-from tint_sumo.study.summary import Row, at_mixes, over_all_mixes, tabulate, varied
+from tint_sumo.study.summary import (
+    Row,
+    at_mixes,
+    by_line,
+    in_other_conditions,
+    in_worlds,
+    labels,
+    looks,
+    tabulate,
+    varied,
+)
 
 AS_TRAINED = Conditions(ALL_MIXES)
 NOISY, SLOW, FAST = Conditions(ALL_MIXES, 0.1), Conditions(ALL_MIXES, tau_s=1.5), Conditions(ALL_MIXES, tau_s=0.7)
@@ -68,7 +79,12 @@ def test_trainings_for_other_mixes_and_shipped_policies_are_rows_of_their_own() 
     fared = {Conditions(Mix(0.4)): (1, 0, 1)}
     rows = tabulate([trained("vae", 0, fared), given("vae", fared), trained("vae", 0, fared, mix=Mix(0.4))])
     assert [(row.origin, row.mix) for row in rows] == [("given", None), ("trained", ALL_MIXES), ("trained", Mix(0.4))]
-    assert [row.title for row in rows] == ["paper's method (old world)", "paper's method", "paper's method"]
+    assert [row.title for row in rows] == [
+        "paper's method (old world)",
+        "paper's method (trained at P 0.1 to 0.9)",
+        "paper's method (trained at P 0.4)",
+    ]
+    assert [row.title for row in tabulate([trained("vae", 0, fared, mix=Mix(0.4))])] == ["paper's method"]
     assert find(tabulate(SOME_RESULTS), "ttc", Conditions(Mix(0.25))).title == "time to collision"
 
 
@@ -100,10 +116,30 @@ def test_the_paper_s_numbers_stand_beside_the_paper_s_own_conditions_alone() -> 
 
 
 def test_the_main_table_has_the_mixes_and_another_one_the_conditions() -> None:
-    fared = dict.fromkeys((Conditions(Mix(0.4)), Conditions(Mix(0.4), 0.1), AS_TRAINED, NOISY, HALF), (1, 0, 0))
+    fared = dict.fromkeys((Conditions(Mix(0.4)), Conditions(Mix(0.6)), AS_TRAINED, NOISY, HALF), (1, 0, 0))
     rows = tabulate([trained("oracle", 0, fared)])
-    assert [row.conditions for row in at_mixes(rows)] == [Conditions(Mix(0.4))]
-    assert [row.conditions for row in over_all_mixes(rows)] == [AS_TRAINED, NOISY, HALF]
+    assert [row.conditions for row in at_mixes(rows)] == [Conditions(Mix(0.4)), Conditions(Mix(0.6))]
+    assert [row.conditions for row in in_other_conditions(rows)] == [AS_TRAINED, NOISY, HALF]
+
+
+def test_every_row_is_in_a_table_whatever_the_mix_of_its_cases() -> None:
+    base, slow = Conditions(Mix(0.4)), Conditions(Mix(0.4), tau_s=1.5)
+    world, half = Conditions(Mix(0.4), world="towns"), Conditions(ALL_MIXES, percent=50, world="towns")
+    rows = tabulate([trained("oracle", 0, dict.fromkeys((base, slow, Conditions(Mix(0.6)), world, half), (1, 0, 0)))])
+    assert [row.conditions for row in at_mixes(rows)] == [base, Conditions(Mix(0.6))]
+    assert [row.conditions for row in in_other_conditions(rows)] == [base, slow], "beside the same mix as trained"
+    assert [row.conditions for row in in_worlds(rows)] == [world, half]
+
+
+def test_names_of_conditions_and_lines_have_the_mix_where_there_are_several() -> None:
+    slow, other = Conditions(Mix(0.4), tau_s=1.5), Conditions(Mix(0.6), world="towns")
+    rows = tabulate([given("ttc", {slow: (1, 0, 0), other: (1, 0, 0), Conditions(Mix(0.4)): (1, 0, 0)})])
+    assert list(labels(rows).values()) == ["as trained, P 0.4", "headway 1.5 s, P 0.4", "128 towns, P 0.6"]
+    assert list(by_line(rows)) == ["time to collision, P 0.4", "time to collision, P 0.6"]
+    first, second = looks(by_line(rows))
+    assert first == METHODS["ttc"].look and first.colour == second.colour and first.marker != second.marker
+    assert list(labels(rows[:2]).values()) == ["as trained", "headway 1.5 s"]
+    assert list(by_line(rows[:2])) == ["time to collision"]
 
 
 def test_rows_tell_the_headway_of_the_scene_s_drivers_where_no_other_one_is_tested() -> None:

@@ -20,6 +20,7 @@ from tint_sumo.config import (
 )
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import claim_folder, write_text
+from tint_sumo.core.percentages import percent
 from tint_sumo.core.progress import Report
 from tint_sumo.core.ranges import require_distinct
 from tint_sumo.core.structures import overlay, plain, require_fields
@@ -27,11 +28,11 @@ from tint_sumo.core.yaml_files import read_list
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.jobs import Workers, executor_of
 from tint_sumo.methods.evaluation import TUNING_SET, require_cases
-from tint_sumo.methods.registry import METHODS, Learned, find_learned, with_shared_trainings
-from tint_sumo.scenes import T_INTERSECTION, Scene, described, paper_scene
+from tint_sumo.methods.registry import find_learned, learned_methods, with_shared_trainings
+from tint_sumo.scenes import Scene, described, paper_scene
 from tint_sumo.study.budgets import Conditions, Trials
 from tint_sumo.study.jobs import EvaluateJob, TrainJob
-from tint_sumo.study.plan import require_scene
+from tint_sumo.study.plan import require_scene, require_traits
 from tint_sumo.study.results import Result
 from tint_sumo.study.tables import Lines, Table
 
@@ -66,7 +67,8 @@ class Sweep:
             trained = self.p_conservative.text
             raise InputError(f"p_conservative must include one of {tested}, where policies are tested, not {trained}")
         self._require_values()
-        _require_traits([find_learned(name) for name in self.methods], require_scene("a sweep", self.scene))
+        others = ", ".join(name for name in learned_methods() if not find_learned(name).encoder)
+        require_traits(self.methods, require_scene("a sweep", self.scene), f"choose methods without one: {others}")
 
     def _require_values(self) -> None:
         """Raise InputError unless every setting is known, and each value fits, is given once, and makes a name."""
@@ -255,24 +257,13 @@ def _lines(table: pd.DataFrame) -> Lines:
     lines = [["settings", "method", *(f"P {p:g}" for p in mixes), "mean"]]
     for (variant, method), rows in found:
         cells = [_with_spread(rows.loc[rows["p_conservative"] == p, "success"]) for p in mixes]
-        lines.append([str(variant), str(method), *cells, f"{100 * rows['success'].mean():.1f}"])
+        lines.append([str(variant), str(method), *cells, percent(rows["success"].mean())])
     return lines
 
 
 def _with_spread(shares: "pd.Series[float]") -> str:
     spread = f" ± {100 * shares.std(ddof=1):.1f}" if len(shares) > 1 else ""
-    return f"{100 * shares.mean():.1f}{spread}"
-
-
-def _require_traits(methods: Sequence[Learned], scene: Scene) -> None:
-    """Raise InputError unless there are trait models for these methods in this scene."""
-    inferring = [method.name for method in methods if method.encoder]
-    if inferring and scene.digest != paper_scene().digest:
-        others = [method.name for method in METHODS.values() if isinstance(method, Learned) and not method.encoder]
-        raise InputError(
-            f"{', '.join(inferring)}: the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; "
-            f"choose methods without one: {', '.join(others)}"
-        )
+    return f"{percent(shares.mean())}{spread}"
 
 
 def _word(value: Any) -> str:

@@ -40,13 +40,13 @@ def rate_interval(hits: Hits) -> Interval:
     Both are resampled, each with replacement, as in a new study with other seeds and other cases
     (percentile bootstrap). With few seeds it is somewhat too narrow.
     """
-    seeds, cases = (np.arange(size) for size in hits.shape)
+    seeds, cases = map(_numbers, hits.shape)
     return _interval((seeds, cases), lambda s, c: _mean(hits, s, c))
 
 
 def difference_interval(first: Hits, second: Hits) -> Interval:
     """Return the 95 % interval of one method's rate minus another's on the same cases; their seeds are not paired."""
-    seeds, others, cases = (np.arange(size) for size in (first.shape[0], second.shape[0], first.shape[1]))
+    seeds, others, cases = map(_numbers, (first.shape[0], second.shape[0], first.shape[1]))
     return _interval((seeds, others, cases), lambda s, o, c: _mean(first, s, c) - _mean(second, o, c))
 
 
@@ -98,6 +98,11 @@ def _ends(found: NDArray[np.float64]) -> Interval:
     """Return the percentile interval of a statistic's resamples (R,)."""
     low, high = np.quantile(found, [(1.0 - CONFIDENCE) / 2, (1.0 + CONFIDENCE) / 2])
     return float(low), float(high)
+
+
+def _numbers(size: int) -> NDArray[np.int64]:
+    """Return the numbers of seeds or cases; the only one twice, because SciPy resamples two or more."""
+    return np.arange(size) if size > 1 else np.zeros(2, np.int64)
 
 
 def _interval(samples: Sequence[NDArray[np.int64]], statistic: Callable[..., NDArray[np.float64]]) -> Interval:

@@ -35,6 +35,9 @@ class Policy(Protocol):
         """Return actions (N,) for N observations, and the state for the next call."""
 
 
+_MARKERS = "osD^vPX*hpd<>"
+
+
 @dataclass(frozen=True)
 class Look:
     """Colour and marks of a method in every figure, in the report and in films.
@@ -46,6 +49,11 @@ class Look:
     colour: str = "#70757a"  # "#rrggbb"
     marker: str = "o"  # Matplotlib's
     dash: str = "-"  # Matplotlib's line style
+
+    def variant(self, number: int) -> "Look":
+        """Return the same with another marker, where a method has several lines; itself for 0."""
+        markers = list(dict.fromkeys([self.marker, *_MARKERS]))
+        return replace(self, marker=markers[number % len(markers)])
 
 
 @dataclass(frozen=True)

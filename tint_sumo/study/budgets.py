@@ -92,6 +92,8 @@ class Trials:
     episodes: Annotated[int, Range(1, 1_000_000)]
 
     def __post_init__(self) -> None:
+        if not self.conditions:
+            raise InputError("conditions must be one or more")
         require_ranges(self)
 
     def relative_to(self, scene_tau_s: float) -> "Trials":
@@ -111,11 +113,11 @@ class Budget:
     methods: Many[str] = ("always_go", "ttc", "no_labels", "vae", "oracle")
     mixes: Many[Mix] = (ALL_MIXES,)  # P(conservative) in training: a policy for each
     seeds: Many[Seed] = (0, 1, 2)
-    trials: Many[Trials] = ()
+    trials: Many[Trials] = field(kw_only=True)
     with_shipped: bool = False  # test the shipped policies, too
 
     def __post_init__(self) -> None:
-        require_distinct(self, "methods", "mixes", "seeds")
+        require_distinct(self, "methods", "mixes", "seeds", "trials")
         require_ranges(self)
         if self.world is not None:
             find_world(self.world)

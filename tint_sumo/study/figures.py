@@ -1,6 +1,6 @@
 """Figures of a study's results."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -10,14 +10,25 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tint_sumo.config import ALL_MIXES, Mix
 from tint_sumo.core.files import whole_file
 from tint_sumo.core.percentages import percent
 from tint_sumo.core.statistics import Scores
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
-from tint_sumo.envs.worlds import find_world
-from tint_sumo.methods.registry import METHODS, look_of
+from tint_sumo.methods.registry import Look, look_of
 from tint_sumo.study.jobs import smoothed_percent
-from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, by_world, marker_offset, varied
+from tint_sumo.study.summary import (
+    CONDITION_TITLES,
+    Summary,
+    by_line,
+    by_title,
+    labels,
+    looks,
+    marker_offset,
+    title_of,
+    titles_and_looks,
+    varied,
+)
 
 COLOURS = {"success": "#3b8a5a", "timeout": "#e8c468", "collision": "#c8503c"}
 INK = {"success": "white", "timeout": "black", "collision": "white"}  # colours of the numbers on these colours
@@ -79,21 +90,23 @@ def _plot_panel(axes: Axes, rows: Sequence[Summary]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def plot_curves(curves: Mapping[str, Sequence[pd.DataFrame]], file: Path) -> Path:
+def plot_curves(curves: Mapping[tuple[str, Mix], Sequence[pd.DataFrame]], file: Path) -> Path:
     """Draw success in training against decisions: the mean over seeds, and the range between them as a band.
 
     Args:
-        curves: of each method, a frame per seed with columns decisions and success.
+        curves: of each method and mix in training, a frame per seed with columns decisions and success.
         file: of the PNG.
     """
     figure = Figure(figsize=(7.5, 4.6), dpi=150, layout="constrained")
     axes = figure.subplots()
-    for method, seeds in curves.items():
+    for seeds, (title, look) in zip(curves.values(), titles_and_looks(curves), strict=True):
         success = smoothed_percent(seeds)
-        at, style = success.index.to_numpy(), _line_style(method) | {"markevery": 0.12}
-        axes.plot(at, success.mean(axis=1), label=METHODS[method].title, **style)
+        at, style = success.index.to_numpy(), _line_style(look) | {"markevery": 0.12}
+        axes.plot(at, success.mean(axis=1), label=title, **style)
         axes.fill_between(at, success.min(axis=1), success.max(axis=1), color=style["color"], alpha=0.12, lw=0)
-    axes.set(xlabel="decisions", ylabel="success in training, all mixes (%)", ylim=(0, 100))
+    axes.set(
+        xlabel="decisions", ylabel=f"success in training{_cases_at({mix for _, mix in curves})} (%)", ylim=(0, 100)
+    )
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize=8, ncols=2)
     return _write(figure, file)
@@ -103,12 +116,13 @@ def plot_conditions(rows: Sequence[Summary], file: Path) -> Path:
     """Draw success in other conditions than the training's, and after parts of the training; a line per method."""
     figure = Figure(figsize=(11.0, 4.2), dpi=150, layout="constrained")
     all_axes = figure.subplots(1, 3, sharey=True)
+    lines = by_line(rows)
     for axes, (name, title) in zip(all_axes, CONDITION_TITLES.items(), strict=True):
-        for found in by_title(rows).values():
-            _plot_line(axes, found, name)
+        for (label, found), look in zip(lines.items(), looks(lines), strict=True):
+            _plot_line(axes, found, name, label, look)
         axes.set_xlabel(title)
         axes.grid(alpha=0.25)
-    all_axes[0].set_ylabel("success, all mixes (%)")
+    all_axes[0].set_ylabel(f"success{_cases_of(rows)} (%)")
     entries = all_axes[0].get_legend_handles_labels()
     figure.legend(*entries, loc="outside lower center", ncols=6, frameon=False, fontsize=8)
     return _write(figure, file)
@@ -117,15 +131,15 @@ def plot_conditions(rows: Sequence[Summary], file: Path) -> Path:
 def plot_profiles(found: Mapping[str, Scores], file: Path) -> Path:
     """Draw performance profiles: the share of trainings and conditions in which a method succeeds more often than this.
 
-    A line that falls early shows trainings that fail (Agarwal et al. 2021). ``found`` has success (S, T) by title.
+    A line that falls early shows trainings that fail (Agarwal et al. 2021). ``found`` has success (S, T) by method.
     """
-    looks = {method.title: name for name, method in METHODS.items()}
     figure = Figure(figsize=(7.5, 4.6), dpi=150, layout="constrained")
     axes = figure.subplots()
     thresholds = np.linspace(0.0, 1.0, 201)
-    for title, scores in found.items():
+    for method, scores in found.items():
         shares = (scores.flatten()[:, None] > thresholds).mean(axis=0)
-        axes.plot(100.0 * thresholds, 100.0 * shares, label=title, **_line_style(looks[title]) | {"markevery": 0.12})
+        style = _line_style(look_of(method)) | {"markevery": 0.12}
+        axes.plot(100.0 * thresholds, 100.0 * shares, label=title_of(method), **style)
     axes.set(xlabel="success (%)", ylabel="trainings and conditions with more than that (%)")
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize=8, ncols=2)
@@ -134,39 +148,50 @@ def plot_profiles(found: Mapping[str, Scores], file: Path) -> Path:
 
 def plot_worlds(rows: Sequence[Summary], file: Path) -> Path:
     """Draw success and collisions with 95 % intervals: a line for each world, a marker for each method."""
-    worlds, methods = by_world(rows), by_title(rows)
+    worlds, methods = labels(rows), by_title(rows)
     figure = Figure(figsize=(11.0, 1.6 + 0.42 * len(worlds)), dpi=150, layout="constrained")
     all_axes = figure.subplots(1, 2, sharey=True)
     for axes, outcome in zip(all_axes, ("success", "collision"), strict=True):
-        for position, found in enumerate(methods.values()):
+        for position, (found, look) in enumerate(zip(methods.values(), looks(methods), strict=True)):
             shift = marker_offset(position, len(methods), 0.32)
-            heights = [list(worlds).index(str(row.conditions.world)) + shift for row in found]
+            heights = [list(worlds).index(row.conditions) + shift for row in found]
             rates = np.array([100.0 * row.rate(outcome) for row in found])
             limits = 100.0 * np.array([row.intervals[outcome] for row in found]).T
-            style = _line_style(found[0].method, is_open=found[0].is_shipped) | {"linestyle": "none", "elinewidth": 0.8}
+            style = _line_style(look, is_open=found[0].is_shipped) | {"linestyle": "none", "elinewidth": 0.8}
             axes.errorbar(rates, heights, xerr=np.abs(limits - rates), label=found[0].title, **style)
-        axes.set_xlabel(f"{outcome}, all mixes (%)")
+        axes.set_xlabel(f"{outcome}{_cases_of(rows)} (%)")
         axes.set_xlim(left=-1.0, right=101.0 if outcome == "success" else None)
         axes.grid(alpha=0.25)
-    all_axes[0].set_yticks(range(len(worlds)), [find_world(world).title for world in worlds], fontsize=8)
+    all_axes[0].set_yticks(range(len(worlds)), list(worlds.values()), fontsize=8)
     all_axes[0].invert_yaxis()
     entries = all_axes[0].get_legend_handles_labels()
     figure.legend(*entries, loc="outside lower center", ncols=6, frameon=False, fontsize=8)
     return _write(figure, file)
 
 
-def _plot_line(axes: Axes, rows: Sequence[Summary], name: str) -> None:
+def _cases_of(rows: Sequence[Summary]) -> str:
+    return _cases_at({row.conditions.p_conservative for row in rows})
+
+
+def _cases_at(mixes: Collection[Mix]) -> str:
+    """Return words about P(conservative) of the cases for the name of an axis; none where lines are named by it."""
+    first, *others = mixes
+    if others:
+        return ""
+    return ", all mixes" if first == ALL_MIXES else f", P {first.text}"
+
+
+def _plot_line(axes: Axes, rows: Sequence[Summary], name: str, label: str, look: Look) -> None:
     if points := varied(rows, name):
         values = list(points)
         success = np.array([100.0 * points[value].rate("success") for value in values])
         limits = np.array([[100.0 * end for end in points[value].intervals["success"]] for value in values]).T
-        style = _line_style(rows[0].method, is_open=rows[0].is_shipped) | {"capsize": 2, "elinewidth": 0.8}
-        axes.errorbar(values, success, yerr=np.abs(limits - success), label=rows[0].title, **style)
+        style = _line_style(look, is_open=rows[0].is_shipped) | {"capsize": 2, "elinewidth": 0.8}
+        axes.errorbar(values, success, yerr=np.abs(limits - success), label=label, **style)
 
 
-def _line_style(method: str, *, is_open: bool = False) -> dict[str, Any]:
+def _line_style(look: Look, *, is_open: bool = False) -> dict[str, Any]:
     """Return Matplotlib's arguments for a method's line; a shipped policy has open markers."""
-    look = look_of(method)
     style = {"color": look.colour, "marker": look.marker, "linestyle": look.dash, "ms": 4.5, "lw": 1.3}
     return style | ({"markerfacecolor": "white"} if is_open else {})
 

@@ -1,5 +1,6 @@
 """The study's jobs of training policies and of testing them."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -194,17 +195,27 @@ def policy_path(out: Path, method: str, mix: Mix | None, seed: int, percent: int
     return snapshot_stem(out / policy_folder(method, mix, seed), percent).with_suffix(".safetensors")
 
 
-def read_curves(out: Path) -> dict[str, list[pd.DataFrame]]:
-    """Return the curves of the trainings of the study in ``out``, one per seed, by method in the registry's order.
+def read_curves(out: Path) -> dict[tuple[str, Mix], list[pd.DataFrame]]:
+    """Return the curves of the trainings of the study in ``out``, one per seed, by method and mix in training.
 
-    A training in which no episode has ended yet has none.
+    Methods have the registry's order. A training in which no episode has ended yet has no curve.
 
     Raises:
         InputError: a file is damaged.
     """
-    files = {name: sorted((out / "policies").glob(f"{name}-P*/{CURVE_FILE}")) for name in METHODS}
-    found = {name: [curve for curve in map(_read_curve, paths) if len(curve)] for name, paths in files.items()}
-    return {name: curves for name, curves in found.items() if curves}
+    found: dict[tuple[str, Mix], list[pd.DataFrame]] = {}
+    for name in METHODS:
+        folders = [(_mix_in(folder.name, name), folder) for folder in (out / "policies").glob(f"{name}-P*")]
+        for mix, folder in sorted((mix, folder) for mix, folder in folders if mix is not None):
+            if (folder / CURVE_FILE).exists() and len(curve := _read_curve(folder / CURVE_FILE)):
+                found.setdefault((name, mix), []).append(curve)
+    return found
+
+
+def _mix_in(folder: str, method: str) -> Mix | None:
+    """Return the mix of a training in the name of its folder, which is the policy's ``label``; None in other names."""
+    text = re.fullmatch(rf"{re.escape(method)}-P([\d.e-]+)(?:to([\d.e-]+))?-seed\d+", folder)
+    return Mix(*(float(number) for number in text.groups() if number)) if text else None
 
 
 def smoothed_percent(seeds: Sequence[pd.DataFrame]) -> pd.DataFrame:

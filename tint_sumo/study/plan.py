@@ -1,7 +1,10 @@
 """The whole study: record, learn traits, train and test every policy, report."""
 
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
+from tint_sumo.config import Mix
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import claim_folder
 from tint_sumo.core.structures import plain
@@ -20,7 +23,7 @@ from tint_sumo.scenes import (
     require_trait_steps,
 )
 from tint_sumo.scenes.drivers import require_two_kinds
-from tint_sumo.study.budgets import Budget
+from tint_sumo.study.budgets import Budget, Trials
 from tint_sumo.study.ceiling_job import CeilingJob
 from tint_sumo.study.folders import DATASET
 from tint_sumo.study.jobs import EvaluateJob, TrainJob
@@ -44,7 +47,13 @@ def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
     encoders = dict.fromkeys(filter(None, (find_learned(name).encoder for name in trained)))
     traits = [] if budget.traits is None else [TraitJob(name, budget.traits, out) for name in encoders]
     given = rules + (shipped_policies() if budget.with_shipped and base == paper_scene() else [])
-    trials = tuple(trials.relative_to(scene.tau_s) for trials in budget.trials)
+    if any(find_learned(name).infers_traits for name in learned):
+        require_trait_steps(scene)
+    if budget.traits is None:
+        remedy = "give the budget traits, and windows to learn them from, as the budget quick has"
+        require_traits(learned, scene, remedy)
+    trials = _trials_in(scene, budget)
+    _require_tests(budget.mixes if learned else (), trials)
     jobs: list[Job] = [*traits]
     for seed in budget.seeds:
         trainings = [
@@ -56,6 +65,34 @@ def plan(budget: Budget, out: Path, scene: Scene | None = None) -> list[Job]:
         jobs += [EvaluateJob(name, mix, seed, trials, out, scene) for mix in budget.mixes for name in learned]
     tests = [EvaluateJob(name, None, 0, trials, out, scene) for name in given]
     return [*jobs, CeilingJob(trials, out, scene), *tests]
+
+
+def _trials_in(scene: Scene, budget: Budget) -> tuple[Trials, ...]:
+    """Return the tests of a budget in a scene.
+
+    Raises:
+        InputError: there are the same conditions twice, whose cases would count as those of more seeds.
+    """
+    trials = tuple(trials.relative_to(scene.tau_s) for trials in budget.trials)
+    counts = Counter(conditions for one in trials for conditions in one.conditions)
+    for conditions, count in counts.items():
+        if count > 1:
+            raise InputError(
+                f"trials must have each conditions once, not P(conservative) {conditions.p_conservative.text} "
+                f"{conditions.label} {count} times; a headway of {scene.tau_s:g} s is that of the scene's drivers"
+            )
+    return trials
+
+
+def _require_tests(mixes: Sequence[Mix], trials: Sequence[Trials]) -> None:
+    """Raise InputError unless policies that are trained at each of the mixes are tested somewhere."""
+    tested = [conditions.p_conservative for one in trials for conditions in one.conditions]
+    for mix in mixes:
+        if not any(map(mix.contains, tested)):
+            raise InputError(
+                f"mixes: policies trained at {mix.text} are tested nowhere; give trials with p_conservative "
+                f"{mix.text}, or leave this mix out"
+            )
 
 
 def run_study(
@@ -77,7 +114,6 @@ def run_study(
     executor = executor_of(workers)
     base = require_scene("a study", find_scene(scene))
     found = budget.trained_in(base)
-    _require_traits(budget, found)
     jobs = plan(budget, out, base)
     scene_entries = {} if found == paper_scene() else described([found])
     with claim_folder(out, {"kind": "study", **plain(budget), **scene_entries}):
@@ -106,11 +142,11 @@ def require_scene(work: str, scene: AnyScene) -> Scene:
     return found
 
 
-def _require_traits(budget: Budget, scene: Scene) -> None:
-    """Raise InputError unless the study has trait models for the scene, and the scene the steps that they read."""
-    if budget.traits is None and scene.digest != paper_scene().digest:
+def require_traits(methods: Sequence[str], scene: Scene, remedy: str) -> None:
+    """Raise InputError, which ends with a remedy, if a method takes a shipped trait model that is not of the scene."""
+    inferring = [name for name in methods if find_learned(name).encoder]
+    if inferring and scene.digest != paper_scene().digest:
         raise InputError(
-            f"the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; give the budget traits, and "
-            "windows to learn them from, as the budget quick has"
+            f"{', '.join(inferring)}: the shipped trait models know the scene {T_INTERSECTION}, not {scene.name}; "
+            f"{remedy}"
         )
-    require_trait_steps(scene)

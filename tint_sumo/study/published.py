@@ -1,7 +1,11 @@
 """Results of the paper, for comparison."""
 
+from collections.abc import Mapping
+
+Rates = Mapping[tuple[str, float], tuple[float, float, float]]
+
 # Success, timeout and collision in percent of 500 episodes, by method and P(conservative); paper Fig. 4.
-RATES_PERCENT: dict[tuple[str, float], tuple[float, float, float]] = {
+RATES_PERCENT: Rates = {
     ("oracle", 0.25): (85, 1, 14),
     ("oracle", 0.4): (90, 4, 5),
     ("oracle", 0.6): (98, 0, 2),

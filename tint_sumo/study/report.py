@@ -16,24 +16,24 @@ from tint_sumo.core.statistics import (
     interquartile_mean,
 )
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
-from tint_sumo.envs.worlds import find_world
-from tint_sumo.methods.registry import METHODS
 from tint_sumo.study.ceiling_job import read_ceilings
 from tint_sumo.study.figures import plot_bars, plot_conditions, plot_curves, plot_profiles, plot_worlds
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.results import read_results
 from tint_sumo.study.results_csv import Ceilings, to_csv
+from tint_sumo.study.settings import published_for
 from tint_sumo.study.summary import (
     Row,
     Summary,
     at_mixes,
     by_method,
     by_title,
-    by_world,
+    in_other_conditions,
     in_worlds,
-    over_all_mixes,
+    labels,
     scores,
     tabulate,
+    title_of,
 )
 from tint_sumo.study.tables import Lines, Table
 
@@ -57,12 +57,12 @@ def write_report(out: Path) -> StudyReport:
     Raises:
         InputError: there are no results, or a file is damaged.
     """
-    rows, ceilings = tabulate(read_results(out)), read_ceilings(out)
+    rows, ceilings = tabulate(read_results(out), published_for(out)), read_ceilings(out)
     figures = []
     if at_mixes(rows):
         figures.append(plot_bars(at_mixes(rows), out / "results.png"))
-    if over_all_mixes(rows):
-        figures.append(plot_conditions(over_all_mixes(rows), out / "conditions.png"))
+    if in_other_conditions(rows):
+        figures.append(plot_conditions(in_other_conditions(rows), out / "conditions.png"))
     if in_worlds(rows):
         figures.append(plot_worlds(in_worlds(rows), out / "worlds.png"))
     if len(found := scores(rows)) > 1:
@@ -83,7 +83,7 @@ def to_markdown(tables: Sequence[Table]) -> str:
 
 def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
     """Return all tables for readers."""
-    main, varied = at_mixes(rows), over_all_mixes(rows)
+    main, varied, worlds = at_mixes(rows), in_other_conditions(rows), in_worlds(rows)
     tables = []
     if main:
         tables.append(Table("Success by mix of drivers", _success_lines(main, ceilings), _SUCCESS_NOTE))
@@ -94,9 +94,11 @@ def result_tables(rows: Sequence[Row], ceilings: Ceilings) -> list[Table]:
     if len(found := scores(rows)) > 1:
         tables.append(Table("Over seeds and conditions", _robust_lines(found), _ROBUST_NOTE))
     if varied:
-        tables.append(Table("Other conditions and shorter trainings", _condition_lines(varied), _CONDITIONS_NOTE))
-    if in_worlds(rows):
-        tables.append(Table("Worlds", _world_lines(in_worlds(rows)), _WORLDS_NOTE))
+        note = f"Success (collision) in percent; {_cases_of(varied)}. As trained: the conditions of the training."
+        tables.append(Table("Other conditions and shorter trainings", _condition_lines(varied), note))
+    if worlds:
+        note = f"Success / timeout / collision in percent; {_cases_of(worlds)}. {_WORLD_NOTE}"
+        tables.append(Table("Worlds", _world_lines(worlds), note))
     return tables
 
 
@@ -112,22 +114,15 @@ _OUTCOME_NOTE = (
 )
 _COLLISION_NOTE = "Collisions in 1,000 cases by trait and route of the driver that was hit, over all seeds and mixes."
 _DIFFERENCE_NOTE = (
-    "Difference to another method's success on the same cases, in percentage points with 95 % intervals over seeds and "
-    "cases (bootstrap)."
+    "Difference to another method's success on the same cases, of trainings at the same mix, in percentage points with "
+    "95 % intervals over seeds and cases (bootstrap)."
 )
 _ROBUST_NOTE = (
     "Success in percent over all fully trained policies and all conditions that every method was tested in: the "
     "interquartile mean, which is the mean of the middle half, with its 95 % interval; means of the worst and of the "
     "best seed; and the probability that a training beats one of the method without labels (Agarwal et al. 2021)."
 )
-_CONDITIONS_NOTE = (
-    "Success (collision) in percent; every case has its own P(conservative) between 0.1 and 0.9. The first column is "
-    "the conditions of the training."
-)
-_WORLDS_NOTE = (
-    "Success / timeout / collision in percent; every case has its own P(conservative) between 0.1 and 0.9. A world is "
-    "a population of drivers and a sensor."
-)
+_WORLD_NOTE = "A world is a population of drivers and a sensor."
 
 
 def _success_lines(rows: Sequence[Summary], ceilings: Ceilings) -> Lines:
@@ -184,12 +179,11 @@ def _difference_lines(rows: Sequence[Row]) -> Lines:
     mixes = sorted({_number(row) for row in trained})
     lines = [["method", "less", *(f"P {p:g}" for p in mixes)]]
     for other in ("oracle", "no_labels"):
-        references = {_number(row): row for row in trained if row.method == other}
-        for method in dict.fromkeys(row.method for row in by_method(trained) if row.method != other):
-            at = {_number(row): row for row in trained if row.method == method}
-            if references and at:
-                cells = [_difference(at.get(p), references.get(p)) for p in mixes]
-                lines.append([next(iter(at.values())).title, next(iter(references.values())).title, *cells])
+        for title, found in by_title([row for row in trained if row.method != other]).items():
+            same = [row for row in trained if (row.method, row.mix) == (other, found[0].mix)]
+            if same:
+                at, references = ({_number(row): row for row in rows} for rows in (found, same))
+                lines.append([title, same[0].title, *(_difference(at.get(p), references.get(p)) for p in mixes)])
     return lines
 
 
@@ -201,9 +195,9 @@ def _difference(row: Row | None, other: Row | None) -> str:
 
 
 def _robust_lines(found: Mapping[str, Scores]) -> Lines:
-    reference = found.get(METHODS["no_labels"].title)
+    reference = found.get("no_labels")
     lines = [["method", "seeds", "interquartile mean", "worst seed", "best seed", "beats no labels %"]]
-    for title, method_scores in found.items():
+    for method, method_scores in found.items():
         means = method_scores.mean(axis=1)
         chance = "-"
         if reference is not None and reference is not method_scores:
@@ -211,16 +205,17 @@ def _robust_lines(found: Mapping[str, Scores]) -> Lines:
                 improvement(method_scores, reference), improvement_interval(method_scores, reference)
             )
         middle = percent_and_ends(interquartile_mean(method_scores), interquartile_interval(method_scores))
-        lines.append([title, str(len(means)), middle, percent(float(means.min())), percent(float(means.max())), chance])
+        worst, best = percent(float(means.min())), percent(float(means.max()))
+        lines.append([title_of(method), str(len(means)), middle, worst, best, chance])
     return lines
 
 
 def _condition_lines(rows: Sequence[Summary]) -> Lines:
-    varied = list(dict.fromkeys(row.conditions for row in rows))
-    lines = [["method", *(conditions.label for conditions in varied)]]
+    names = labels(rows)
+    lines = [["method", *names.values()]]
     for title, found in by_title(rows).items():
         rates = {row.conditions: [percent(row.rate(outcome)) for outcome in ("success", "collision")] for row in found}
-        cells = ["{} ({})".format(*rates[conditions]) if conditions in rates else "-" for conditions in varied]
+        cells = ["{} ({})".format(*rates[conditions]) if conditions in rates else "-" for conditions in names]
         lines.append([title, *cells])
     return lines
 
@@ -228,10 +223,21 @@ def _condition_lines(rows: Sequence[Summary]) -> Lines:
 def _world_lines(rows: Sequence[Summary]) -> Lines:
     titles = list(by_title(rows))
     lines = [["world", *titles]]
-    for world, found in by_world(rows).items():
-        at = {row.title: "/".join(f"{100 * row.rate(outcome):.0f}" for outcome in BUILT_IN_OUTCOMES) for row in found}
-        lines.append([find_world(world).title, *(at.get(title, "-") for title in titles)])
+    for conditions, name in labels(rows).items():
+        found = [row for row in rows if row.conditions == conditions]
+        at = {row.title: "/".join(percent(row.rate(outcome), 0) for outcome in BUILT_IN_OUTCOMES) for row in found}
+        lines.append([name, *(at.get(title, "-") for title in titles)])
     return lines
+
+
+def _cases_of(rows: Sequence[Summary]) -> str:
+    """Return a clause about P(conservative) of the cases."""
+    first, *others = {row.conditions.p_conservative for row in rows}
+    if others:
+        return "P is P(conservative) of the cases"
+    if first.is_single:
+        return f"P(conservative) is {first.text}"
+    return f"every case has its own P(conservative) between {first.low:g} and {first.high:g}"
 
 
 def _number(row: Summary) -> float:

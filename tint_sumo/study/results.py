@@ -120,6 +120,8 @@ def read_results(out: Path) -> list[Result]:
     if not files:
         raise InputError(f"no results in {out}; run the study first")
     results = [Result.read(file) for file in files]
+    if not any(result.tested for result in results):
+        raise InputError(f"no policy of {out} was tested; choose trials that meet the mixes of its trainings")
     if any(result.case_set != REPORTED_SET for result in results):
         raise InputError(f"{out} is part of a sweep, whose cases no study reports; read sweep.md in the folder above")
     return results

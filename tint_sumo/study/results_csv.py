@@ -12,7 +12,7 @@ from tint_sumo.core.reading import RESULT_BYTES, read_file
 from tint_sumo.core.statistics import Interval
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.summary import Summary
+from tint_sumo.study.summary import Summary, named
 
 Ceilings = Mapping[float, float]  # share of the cases that a careful driver can finish, by P(conservative)
 
@@ -64,7 +64,7 @@ def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
         conditions, time_s = row.resolved, row.navigation_time_s
         tested = (conditions.position_noise_m, conditions.tau_s, row.scene_tau_s, conditions.percent)
         p = conditions.p_conservative
-        ceiling = ceilings.get(p.low) if p.is_single else None
+        ceiling = ceilings.get(p.low) if row.conditions.is_single_mix else None  # of the scene's own traffic
         numbers: list[str] = []
         for outcome in BUILT_IN_OUTCOMES:
             numbers += (_percent(part) for part in (row.rate(outcome), *row.intervals[outcome], row.spread(outcome)))
@@ -78,7 +78,7 @@ def to_csv(rows: Sequence[Summary], ceilings: Ceilings) -> str:
                 row.episodes,
                 " ".join(map(str, row.seeds)),
                 _percent(ceiling),
-                *(row.published.get(outcome, "") for outcome in BUILT_IN_OUTCOMES),
+                *(f"{row.published[outcome]:g}" if row.published else "" for outcome in BUILT_IN_OUTCOMES),
             ]
         )
     return text.getvalue()
@@ -95,7 +95,8 @@ def read_csv(file: Path) -> tuple[list[StoredRow], dict[float, float]]:
         table = list(csv.DictReader(io.StringIO(content.decode(), newline=""), strict=True))
         if not table:
             raise ValueError("no rows")
-        rows = [_row(line) for line in table]
+        named_mix = named(_mix(line) for line in table)
+        rows = [_row(line, named_mix(_mix(line))) for line in table]
         stated = [line for line in table if line["ceiling_percent"]]
         ceilings = {float(line["p_conservative"]): _read_percent(line["ceiling_percent"]) for line in stated}
     except (KeyError, TypeError, AttributeError, ValueError, csv.Error) as error:
@@ -103,20 +104,26 @@ def read_csv(file: Path) -> tuple[list[StoredRow], dict[float, float]]:
     return rows, ceilings
 
 
-def _row(line: Mapping[str, str]) -> StoredRow:
+def _mix(line: Mapping[str, str]) -> Mix | None:
+    """Return P(conservative) in training."""
+    text = line["trained_p_conservative"]
+    return Mix.from_text(text) if text else None
+
+
+def _row(line: Mapping[str, str], named_mix: Mix | None) -> StoredRow:
     rates, limits, spreads = {}, {}, {}
     for outcome in BUILT_IN_OUTCOMES:
         rate, low, high, spread = (line[f"{outcome}{part}_percent"] for part in _PARTS)
         rates[outcome], limits[outcome] = _read_percent(rate), (_read_percent(low), _read_percent(high))
         spreads[outcome] = _read_percent(spread) if spread else None
-    mix, time_s = line["trained_p_conservative"], line["navigation_time_s"]
+    time_s, published = line["navigation_time_s"], {outcome: line[f"paper_{outcome}_percent"] for outcome in rates}
     p, noise_m, tau_s, scene_tau_s, percent = (line[name] for name in _CONDITIONS[:-1])
     world = line.get("world") or None  # tables of earlier versions have no such column
     given_tau_s = float(tau_s) if tau_s else None
     return StoredRow(
         line["method"],
         line["origin"],
-        Mix.from_text(mix) if mix else None,
+        _mix(line),
         Conditions(Mix.from_text(p), float(noise_m), given_tau_s, int(percent), world).relative_to(float(scene_tau_s)),
         tuple(map(int, line["seeds"].split())),
         float(scene_tau_s),
@@ -125,6 +132,8 @@ def _row(line: Mapping[str, str]) -> StoredRow:
         limits,
         spreads,
         float(time_s) if time_s else None,
+        named_mix=named_mix,
+        published={outcome: float(rate) for outcome, rate in published.items() if rate},
     )
 
 

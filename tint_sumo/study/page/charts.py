@@ -7,11 +7,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from tint_sumo.config import Mix
 from tint_sumo.core.percentages import percent
-from tint_sumo.envs.worlds import find_world
-from tint_sumo.methods.registry import METHODS, Look, look_of
+from tint_sumo.methods.registry import Look
 from tint_sumo.study.jobs import smoothed_percent
-from tint_sumo.study.summary import CONDITION_TITLES, Summary, by_title, by_world, marker_offset, varied
+from tint_sumo.study.summary import (
+    CONDITION_TITLES,
+    Summary,
+    by_line,
+    by_title,
+    labels,
+    looks,
+    marker_offset,
+    titles_and_looks,
+    varied,
+)
 from tint_sumo.study.tables import Lines
 
 # Plotly's names for Matplotlib's markers and line styles.
@@ -69,14 +79,13 @@ def outcome_chart(rows: Sequence[Summary], outcome: str) -> Chart:
     return Chart(outcome, description.capitalize(), lines, {"data": traces, "layout": layout})
 
 
-def curve_chart(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Chart:
+def curve_chart(curves: Mapping[tuple[str, Mix], Sequence[pd.DataFrame]]) -> Chart:
     """Return the chart of success in training against decisions: the mean over the seeds, and their range as a band."""
     traces: list[dict[str, Any]] = []
     lines = [["method", "decisions", "success %", "range of the seeds"]]
-    for method, seeds in curves.items():
-        look = look_of(method)
+    for seeds, (title, look) in zip(curves.values(), titles_and_looks(curves), strict=True):
         success = smoothed_percent(seeds)
-        at, title = success.index.to_numpy(), METHODS[method].title
+        at = success.index.to_numpy()
         middle, low, high = success.mean(axis=1), success.min(axis=1), success.max(axis=1)
         if len(seeds) > 1:
             traces.append(_band(at, low.to_numpy(), high.to_numpy(), look))
@@ -96,11 +105,10 @@ def curve_chart(curves: Mapping[str, Sequence[pd.DataFrame]]) -> Chart:
 
 def condition_charts(rows: Sequence[Summary]) -> list[Chart]:
     """Return charts of success against each condition in which the rows differ from the conditions of the training."""
-    charts = []
+    charts, drawn = [], by_line(rows)
     for name, title in CONDITION_TITLES.items():
         traces, lines = [], [["method", title, "success %", "95 % interval"]]
-        for method, shown_rows in by_title(rows).items():
-            look = look_of(shown_rows[0].method)
+        for (method, shown_rows), look in zip(drawn.items(), looks(drawn), strict=True):
             points = varied(shown_rows, name)
             shares, limits = _rates(list(points.values()), "success")
             for value, row in points.items():
@@ -119,17 +127,17 @@ def condition_charts(rows: Sequence[Summary]) -> list[Chart]:
 
 def world_chart(rows: Sequence[Summary], outcome: str) -> Chart:
     """Return the chart of an outcome's rates in each world: a line for each world, a marker for each method."""
-    worlds, methods = by_world(rows), by_title(rows)
-    names = [find_world(world).title for world in worlds]
+    worlds, methods = labels(rows), by_title(rows)
+    names = list(worlds.values())
     traces, lines = [], [["world", "method", f"{outcome} %", "95 % interval"]]
-    for position, (title, shown_rows) in enumerate(methods.items()):
+    for position, ((title, shown_rows), look) in enumerate(zip(methods.items(), looks(methods), strict=True)):
         shift = marker_offset(position, len(methods), _MOST_OFFSET)
         shares, limits = _rates(shown_rows, outcome)
-        heights = [list(worlds).index(str(row.conditions.world)) + shift for row in shown_rows]
-        line = _marks(shares, heights, title, look_of(shown_rows[0].method), is_open=shown_rows[0].is_shipped)
+        heights = [list(worlds).index(row.conditions) + shift for row in shown_rows]
+        line = _marks(shares, heights, title, look, is_open=shown_rows[0].is_shipped)
         traces.append({**line, "mode": "markers", "error_x": _errors(shares, limits)})
-    for name, shown_rows in zip(names, worlds.values(), strict=True):
-        for row in shown_rows:
+    for conditions, name in worlds.items():
+        for row in (row for row in rows if row.conditions == conditions):
             lines.append([name, row.title, percent(row.rate(outcome)), _span(row.intervals[outcome])])
     layout = {
         "height": 120 + _ROW_PX * len(names),

@@ -8,7 +8,7 @@ from tint_sumo.config import Mix
 from tint_sumo.methods.evaluation import Evaluation
 from tint_sumo.study.budgets import Conditions
 from tint_sumo.study.jobs import label
-from tint_sumo.study.summary import Row, at_mixes, by_title, in_worlds, over_all_mixes
+from tint_sumo.study.summary import Row, at_mixes, by_title, in_other_conditions, in_worlds
 
 FAILURES = ("collision", "timeout")
 MOST_CASES = 14
@@ -42,7 +42,7 @@ class Choice:
 
 def choose(rows: Sequence[Row]) -> Choice:
     """Return the conditions in which most policies were tested, and cases in which their outcomes differ."""
-    tested = at_mixes(rows) or over_all_mixes(rows) or in_worlds(rows)
+    tested = at_mixes(rows) or in_other_conditions(rows) or in_worlds(rows)
     numbers = Counter(row.conditions for row in tested)
     common = [conditions for conditions, number in numbers.items() if number == max(numbers.values())]
     conditions = common[(len(common) - 1) // 2]

@@ -1,13 +1,14 @@
 """The meaning of P and the main results, in a few sentences before all tables."""
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from tint_sumo.config import WORLDS
 from tint_sumo.core.percentages import percent
 from tint_sumo.envs.worlds import find_world
 from tint_sumo.methods.registry import METHODS, Learned
 from tint_sumo.study.budgets import Conditions
-from tint_sumo.study.summary import Summary, at_mixes, by_title, in_worlds, over_all_mixes
+from tint_sumo.study.summary import Summary, at_mixes, by_title, in_worlds
 
 MEANING_OF_P = (
     "P is P(conservative): the probability that a driver is conservative, and yields when the ego moves in front of "
@@ -21,14 +22,15 @@ def what_came_out(rows: Sequence[Summary]) -> str:
     Rates are means over the mixes of drivers that all methods were tested on, or over worlds if policies were tested
     in these alone; empty where there is none.
     """
-    as_trained = [row for row in over_all_mixes(rows) if row.conditions == Conditions(row.conditions.p_conservative)]
-    methods = by_title(at_mixes(rows) or as_trained or in_worlds(rows))
+    as_trained = [row for row in rows if row.conditions == Conditions(row.conditions.p_conservative)]
+    whole = [row for row in in_worlds(rows) if row.conditions.percent == 100]
+    methods = _by_method(at_mixes(rows) or as_trained or whole)
     common = (
         set.intersection(*({row.conditions for row in tested} for tested in methods.values())) if methods else set()
     )
     if not common:
         return ""
-    shown = by_title([row for tested in methods.values() for row in tested if row.conditions in common])
+    shown = _by_method([row for tested in methods.values() for row in tested if row.conditions in common])
     rates = {title: sum(row.rate("success") for row in tested) / len(tested) for title, tested in shown.items()}
     at = _where(common)
     if len(rates) == 1:
@@ -46,6 +48,11 @@ def what_came_out(rows: Sequence[Summary]) -> str:
         text += f" The best method that infers traits, {helped}, reached {percent(rates[helped])} %; {bare}, which "
         text += f"infers none, reached {percent(rates[bare])} %."
     return text
+
+
+def _by_method(rows: Sequence[Summary]) -> dict[str, list[Summary]]:
+    """Return the rows of each method, shipped policies apart, over all mixes in training."""
+    return by_title([replace(row, named_mix=None) for row in rows])
 
 
 def _where(conditions: Collection[Conditions]) -> str:

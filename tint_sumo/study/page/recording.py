@@ -146,7 +146,7 @@ class Recording:
 
     @property
     def _policy(self) -> str | Path:
-        return policy_path(self.out, self.method, self.mix, self.seed)
+        return policy_path(self.out, self.method, self.mix, self.seed, self.conditions.percent)
 
     @property
     def _identity(self) -> dict[str, Any]:

@@ -13,12 +13,10 @@ from typing import Any
 from plotly.offline import get_plotlyjs
 
 import tint_sumo
-from tint_sumo.core.errors import InputError
-from tint_sumo.core.files import RUN_FILE, damaged, read_json, write_text
+from tint_sumo.core.files import RUN_FILE, read_json, write_text
 from tint_sumo.jobs import Workers
 from tint_sumo.methods.training import POLICY
 from tint_sumo.policy.storage import read_versions
-from tint_sumo.scenes import Scene, paper_scene, read_described, require_built_in
 from tint_sumo.study.jobs import read_curves
 from tint_sumo.study.page.charts import Chart, condition_charts, curve_chart, outcome_chart, world_chart
 from tint_sumo.study.page.choosing import choose
@@ -27,7 +25,8 @@ from tint_sumo.study.page.findings import MEANING_OF_P, what_came_out
 from tint_sumo.study.page.html import chart, content_policy, folded, json_data, packed, paragraph, section, table
 from tint_sumo.study.page.latents import read_latents
 from tint_sumo.study.report import StudyReport
-from tint_sumo.study.summary import Row, at_mixes, in_worlds, over_all_mixes
+from tint_sumo.study.settings import read_scene_of
+from tint_sumo.study.summary import Row, at_mixes, in_other_conditions, in_worlds
 from tint_sumo.study.tables import Lines, Table
 
 PAGE_FILE = "report.html"
@@ -77,21 +76,6 @@ def write_page(report: StudyReport, out: Path, *, workers: Workers = 2, progress
     )
     write_text(out / PAGE_FILE, _page(study))
     return replace(report, page_file=out / PAGE_FILE)
-
-
-def read_scene_of(out: Path) -> Scene:
-    """Return the scene of the study in ``out``: the paper's, unless its settings name another one.
-
-    Raises:
-        InputError: the settings are damaged.
-    """
-    settings = read_json(out / RUN_FILE, "run settings") if (out / RUN_FILE).exists() else {}
-    if "scene" not in settings:
-        return paper_scene()
-    try:
-        return require_built_in("a study", read_described(settings)[0])
-    except InputError as error:
-        raise damaged(out / RUN_FILE, "run settings", error) from None
 
 
 def _page(study: _Study) -> str:
@@ -175,7 +159,7 @@ def _curves(study: _Study, charts: list[Chart]) -> str:
 
 
 def _conditions(study: _Study, charts: list[Chart]) -> str:
-    varied = over_all_mixes(study.rows)
+    varied = in_other_conditions(study.rows)
     if not varied:
         return _left_out("the study tested its policies in the conditions of their training alone")
     shown = [_shown(drawn, charts) for drawn in condition_charts(varied)]

@@ -137,7 +137,8 @@ def test_cards_of_policies(tmp_path: Path) -> None:
     for suffix in (".json", ".safetensors"):
         shutil.copyfile(shipped("models") / "policies" / f"oracle{suffix}", tmp_path / f"policy{suffix}")
     card = json.loads((tmp_path / "policy.json").read_text())
-    needed = ("method", "p_conservative", "scene", "scene_digest", "traits", "settings", "network", "weights_sha256")
+    needed = {"method", "p_conservative", "scene", "scene_digest", "steps", "seed", "traits", "settings", "network"}
+    needed |= {"weights_sha256"}
     card = {key: value for key, value in card.items() if key in needed}  # the rest may say anything
     card["settings"] = {"action_repeat": card["settings"]["action_repeat"]}
     card["versions"] = {"torch": "2"}

@@ -101,7 +101,10 @@ def test_rows_are_written_read_and_repeated_and_others_refused(tmp_path: Path) -
     false = replace(rows[0], outcomes="".join(other[letter] for letter in rows[0].outcomes))
     assert list(repeat([false], CASES)["same"]) == [0]
     assert "| [mine](https://example.org/mine/tree/abc) |" in leaderboard_markdown(rows, "paper")
-    first, *others = replace(rows[0], outcomes="s" * 299 + "c"), *(replace(row, outcomes="s" * 300) for row in rows[1:])
+    first, *others = (
+        replace(rows[0], outcomes="s" * 2999 + "c"),
+        *(replace(row, outcomes="s" * 3000) for row in rows[1:]),
+    )
     assert "| >99.9 | 0.0 | <0.1 | >99 (" in leaderboard_markdown([first, *others], "paper")
     for changed, message in (
         ("world", "needs a world of suite paper"),

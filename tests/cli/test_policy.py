@@ -29,8 +29,10 @@ def test_policy_train(
     train = ("policy", "train", "--method", "vae", "--config", small_training)
     argv = (*train, "--steps", 1, "--traits", trait_model, "--out", out, "--sensor", "noisy_0.1")
     printed = run(capsys, *argv, "--p-conservative", 0.25)
+    assert printed.pop("scene").startswith("t_intersection")
     assert printed == {
-        "model": str(out / "policy.safetensors"), "method": "vae", "p_conservative": [0.25], "steps": 1, "seed": 0
+        "model": str(out / "policy.safetensors"), "method": "vae", "world": None, "sensors": ["noisy_0.1"],
+        "p_conservative": [0.25], "steps": 1, "seed": 0,
     }  # fmt: skip
     before = files(out)
     assert "another run" in refuse(capsys, *argv, "--p-conservative", 0.3)

@@ -80,11 +80,13 @@ def test_trainings_for_other_mixes_and_shipped_policies_are_rows_of_their_own() 
     rows = tabulate([trained("vae", 0, fared), given("vae", fared), trained("vae", 0, fared, mix=Mix(0.4))])
     assert [(row.origin, row.mix) for row in rows] == [("given", None), ("trained", ALL_MIXES), ("trained", Mix(0.4))]
     assert [row.title for row in rows] == [
-        "paper's method (old world)",
+        "paper's method (shipped)",
         "paper's method (trained at P 0.1 to 0.9)",
         "paper's method (trained at P 0.4)",
     ]
     assert [row.title for row in tabulate([trained("vae", 0, fared, mix=Mix(0.4))])] == ["paper's method"]
+    in_world = Conditions(ALL_MIXES, world="towns")  # where policies of several worlds are shipped
+    assert [row.title for row in tabulate([given("vae", {in_world: (1, 0, 1)})])] == ["paper's method (old world)"]
     assert find(tabulate(SOME_RESULTS), "ttc", Conditions(Mix(0.25))).title == "time to collision"
 
 

@@ -73,7 +73,9 @@ class Summary(ABC):
 
     @property
     def title(self) -> str:
-        return title_of(self.method, self.named_mix) + (" (old world)" if self.is_shipped else "")
+        """The method, and where its policy comes from; among worlds, policies of several are shipped."""
+        shipped = "shipped" if self.conditions.world is None else "old world"
+        return title_of(self.method, self.named_mix) + (f" ({shipped})" if self.is_shipped else "")
 
 
 @dataclass(frozen=True)

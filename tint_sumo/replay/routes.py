@@ -21,14 +21,14 @@ def is_on_edge(lane: str) -> bool:
 
 
 class _Ahead(NamedTuple):
-    """What is ahead of a lane."""
+    """How far a lane leads along a route, and over which connection."""
 
-    edges: int  # of the route over which it leads, its own included, until an ego would have to change lanes
-    way: Any  # the connection to the next of them; None on the last
+    edges: int  # number of edges of the route, its own included, that an ego reaches without changing lanes
+    way: Any  # sumolib's connection to the lane on the next of these edges; None on the last
 
 
 def _ahead(lane: Any, after: Mapping[str, _Ahead]) -> _Ahead:
-    """Return what is ahead of a lane, if this is ahead of the lanes of the next edge."""
+    """Return how far a lane leads, from how far each lane of the next edge does, by its id."""
     ways = [way for way in lane.getOutgoing() if way.getToLane().getID() in after]
     best = max(ways, key=lambda way: after[way.getToLane().getID()].edges, default=None)
     return _Ahead(1, None) if best is None else _Ahead(1 + after[best.getToLane().getID()].edges, best)
@@ -130,7 +130,7 @@ class Routes:
         return found
 
     def _open_lanes(self, route: Sequence[str]) -> list[dict[str, "_Ahead"]]:
-        """Return what is ahead of each lane that is open to an ego, by its id, for each edge of a route."""
+        """Return how far each lane that is open to an ego leads, by its id, for each edge of a route."""
         found: list[dict[str, _Ahead]] = [{}]
         for edge in reversed(route):
             after = found[0]

@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -17,12 +16,12 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.waiting import PATIENCE_S, wait_until
 from tint_sumo.cli.command import SpreadCommand
 from tint_sumo.cli.command_line import parse
 
 ROOT = Path(__file__).parents[1]
 CLUSTER = ROOT / "examples" / "cluster"
-PATIENCE_S = 300.0
 
 # Both stand in for SLURM's own commands and note how they were called. This srun has one machine for all nodes.
 SRUN = """#!/usr/bin/env bash
@@ -93,12 +92,9 @@ class Slurm:
                     found.append(int(file.parent.name))
         return found
 
-    def is_over(self) -> bool:
-        """Whether no process of the job is left. A helper of Ray's dashboard ends some ten seconds after the others."""
-        deadline = time.monotonic() + PATIENCE_S
-        while self.processes() and time.monotonic() < deadline:
-            time.sleep(0.1)
-        return not self.processes()
+    def wait_until_over(self) -> None:
+        """Wait until no process of the job is left. A helper of Ray's dashboard ends ten seconds after the others."""
+        wait_until(lambda: not self.processes())
 
 
 @pytest.fixture
@@ -106,7 +102,8 @@ def slurm(tmp_path: Path) -> Iterator[Slurm]:
     machine = Slurm(tmp_path)
     yield machine
     for process in machine.processes():
-        os.kill(process, signal.SIGKILL)
+        with suppress(ProcessLookupError):  # it has ended meanwhile
+            os.kill(process, signal.SIGKILL)
     shutil.rmtree(f"/tmp/ray-{machine.job}", ignore_errors=True)
 
 
@@ -123,17 +120,14 @@ def test_slurm_runs_a_command_on_all_nodes_and_ends_ray(slurm: Slurm, tmp_path: 
     head, workers = slurm.calls.read_text().splitlines()  # and no scontrol
     assert "--nodes=1" in head and "--nodelist=node1" in head
     assert "--nodes=1" in workers and "--exclude=node1" in workers
-    assert slurm.is_over()
+    slurm.wait_until_over()
 
 
 @pytest.mark.slow
 def test_slurm_puts_a_command_back_into_the_queue_before_its_time_is_over(slurm: Slurm, tmp_path: Path) -> None:
     begun = tmp_path / "begun"
     process = slurm.start(1, "bash", "-c", f"touch {begun}; exec sleep 1000")
-    deadline = time.monotonic() + PATIENCE_S
-    while not begun.exists():
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.1)
+    wait_until(begun.exists, process)
     process.send_signal(signal.SIGUSR1)
     process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 128 + signal.SIGTERM

@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 
 from tests.terminal import look, open_terminal
+from tests.waiting import PATIENCE_S
 from tint_sumo.cli import main
-
-PATIENCE_S = 100.0
 
 
 def run(capsys: pytest.CaptureFixture[str], *argv: Any) -> dict[str, Any]:

@@ -9,12 +9,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from tests.waiting import wait_until
 from tint_sumo.core import file_changes, stores
 from tint_sumo.core.errors import InputError, JobError
 from tint_sumo.core.file_changes import Changes
@@ -30,13 +31,6 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 @pytest.fixture
 def file_url(tmp_path: Path) -> str:
     return f"file://{tmp_path}/store"
-
-
-def wait_until(condition: Callable[[], bool], limit_s: float = 30.0) -> None:
-    latest = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < latest
-        time.sleep(0.05)
 
 
 @pytest.mark.parametrize(

@@ -5,17 +5,15 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from tests.dataset.test_recorder import TWO_SHARDS, contents
+from tests.waiting import wait_until
 from tint_sumo.dataset.recorder import record
 from tint_sumo.dataset.schema import FCD, MANIFEST, TABLES, TRAJECTORIES
-
-PATIENCE_S = 60.0
 
 # Workers import this, too. Where a file's name ends with the moment, it is cut in half, as if it were just being
 # written, and nothing goes on. Where no moment is given, nothing goes on before the last file: a signal comes first.
@@ -55,19 +53,15 @@ class Recording:
         self._process = subprocess.Popen([sys.executable, str(self._script)], stderr=subprocess.DEVNULL, env=marked)
 
     def wait_for(self, file: Path) -> None:
-        end = time.monotonic() + PATIENCE_S
-        while not file.exists():
-            assert self._process.poll() is None, "it has ended"
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        wait_until(file.exists, self._process)
 
     def end(self, sent: signal.Signals) -> None:
         os.kill(self._process.pid, sent)
         self._process.wait()
-        end = time.monotonic() + PATIENCE_S
-        while any(str(self._script) in _environment(process) for process in Path("/proc").glob("[0-9]*")):
-            assert time.monotonic() < end, "a worker outlives the main process"
-            time.sleep(0.05)
+        wait_until(lambda: not self._is_running())
+
+    def _is_running(self) -> bool:
+        return any(str(self._script) in _environment(process) for process in Path("/proc").glob("[0-9]*"))
 
 
 def _environment(process: Path) -> str:

@@ -14,6 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 from PIL import ImageGrab
 
+from tests.waiting import wait_until
 from tint_sumo import ENV_IDS
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs.rendering import render_scene
@@ -44,10 +45,12 @@ def display(_virtual_display: str, monkeypatch: pytest.MonkeyPatch) -> str:
 
 def wait_for(display: str, expected: NDArray[np.uint8] | int) -> None:
     """Wait until the screen shows this where a window of the scene's size lies, as nobody moves it."""
-    give_up_s = time.monotonic() + 20.0
-    while (np.asarray(ImageGrab.grab(xdisplay=display).convert("RGB"))[:320, :736] != expected).any():
-        assert time.monotonic() < give_up_s, "the screen shows something else"
-        time.sleep(0.02)
+
+    def is_shown() -> bool:
+        screen = np.asarray(ImageGrab.grab(xdisplay=display).convert("RGB"))
+        return bool((screen[:320, :736] == expected).all())
+
+    wait_until(is_shown)
 
 
 def test_the_window_follows_the_episodes_in_real_time(display: str) -> None:

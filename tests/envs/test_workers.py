@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -17,13 +16,12 @@ import numpy as np
 import pytest
 
 from tests.envs.test_environments import ENV_ID, assert_equal
+from tests.waiting import PATIENCE_S, is_alive, wait_until
 from tint_sumo.config import SENSORS
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.envs.vector import SceneVectorEnv
-
-PATIENCE_S = 300.0
 
 
 @pytest.fixture
@@ -37,17 +35,8 @@ def worker_ids() -> list[int]:
     return [process.pid for process in multiprocessing.active_children() if process.pid is not None]
 
 
-def is_alive(process_id: int) -> bool:
-    """Zombies have ended, too."""
-    stat = Path(f"/proc/{process_id}/stat")
-    return stat.exists() and stat.read_text().rsplit(")", 1)[1].split()[0] != "Z"
-
-
 def wait_until_ended(process_ids: list[int]) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while any(map(is_alive, process_ids)):
-        assert time.monotonic() < end, "a worker outlived its main process"
-        time.sleep(0.05)
+    wait_until(lambda: not any(map(is_alive, process_ids)))
 
 
 @pytest.mark.parametrize(("workers", "mode"), [(2, "SameStep"), (3, "NextStep")])

@@ -20,7 +20,7 @@ import pytest
 
 from tests.dataset.test_recorder import TWO_SHARDS, contents
 from tests.jobs.jobs import CountJob, FileJob
-from tests.jobs.test_local import PATIENCE_S, wait_until
+from tests.waiting import PATIENCE_S, wait_until
 from tint_sumo.cli import main
 from tint_sumo.config import Mix, PpoSettings
 from tint_sumo.core.checkpoints import CHECKPOINT_FILE

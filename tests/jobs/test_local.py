@@ -3,34 +3,18 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.jobs.jobs import FileJob
+from tests.waiting import PATIENCE_S, is_alive, wait_until
 from tint_sumo.core.errors import InputError, JobError
 from tint_sumo.jobs import Local
 from tint_sumo.jobs.process import read_log
 
-PATIENCE_S = 300.0  # slow machines need more than a minute to start nodes beside other work
 STATES = ("begins", "written")
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.05)
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
 
 
 @pytest.fixture

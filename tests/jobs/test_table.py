@@ -13,12 +13,12 @@ import pytest
 from rich.console import Console
 
 from tests.terminal import look, open_terminal
+from tests.waiting import PATIENCE_S
 from tint_sumo.core.progress import Progress
 from tint_sumo.jobs.status import Overview, Status, duration
 from tint_sumo.jobs.table import JobTable, Log, one_job, render
 
 TRAIN, OTHER, TRAITS = "train no_labels-P0.1to0.9-seed0", "train ma-P0.4-seed3", "traits vae"
-PATIENCE_S = 300.0
 HIDE, SHOW = "\x1b[?25l", "\x1b[?25h"  # the cursor
 
 

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -25,6 +24,7 @@ from tests.methods import runs
 from tests.replay.recordings import LOWER_Y_M, Driven, recording, write_street
 from tests.scenes.networks import UserNetwork
 from tests.simulation.scenes import T
+from tests.waiting import wait_until
 from tint_sumo import traits
 from tint_sumo.config import PERFECT, SENSORS, TRAINING_SENSORS, Mix, PolicySettings, PpoSettings, TraitSettings
 from tint_sumo.core.checkpoints import CHECKPOINT_FILE, PICKLES
@@ -349,11 +349,7 @@ def test_a_killed_run_leaves_whole_files_and_goes_on(tmp_path: Path) -> None:
     out = tmp_path / "run"
     process = subprocess.Popen([sys.executable, "-m", "tests.methods.runs", str(out)])
     try:
-        end = time.monotonic() + 120.0
-        while not (out / "policy-25.json").exists():
-            assert process.poll() is None, "the training ended before it was killed"
-            assert time.monotonic() < end, "waited in vain"
-            time.sleep(0.01)
+        wait_until((out / "policy-25.json").exists, process)
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()

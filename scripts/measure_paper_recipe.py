@@ -14,13 +14,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas
 from matplotlib.figure import Figure
 
 from tint_sumo.benchmark import Suite, Trial, evaluate
 from tint_sumo.config import PPO_BUDGETS, SNAPSHOTS_PERCENT, STEP_S, Mix
 from tint_sumo.core.files import whole_file, write_frame
+from tint_sumo.core.sampling import evenly_spread
 from tint_sumo.core.weights import card_file
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.evaluation import REPORTED_SET
@@ -72,7 +72,7 @@ def curve_of(budget: str, folder: Path) -> pandas.DataFrame:
     """Return some points of a training's curve: outcomes in percent of the last 500 episodes."""
     card = read_policy_card(snapshot_stem(folder, 100))
     curve = pandas.read_csv(folder / CURVE_FILE)
-    curve = curve.iloc[np.linspace(0, len(curve) - 1, min(POINTS, len(curve))).round().astype(int)]
+    curve = curve.iloc[evenly_spread(len(curve), POINTS)]
     table = pandas.DataFrame({**training_of(budget, card), "decisions": curve["decisions"]})
     for outcome in BUILT_IN_OUTCOMES:
         table[f"{outcome}_percent"] = (100 * curve[outcome]).round(1)

@@ -196,7 +196,7 @@ def test_recording_again_leaves_a_finished_dataset_alone(dataset: Path) -> None:
         ({"windows": 10, "scene": "moon"}, "unknown scene 'moon'"),
         (
             {"windows": 10, "scene": replace(T, step_s=0.5)},
-            r"steps of 0\.1 s, but the scene t_intersection has step_s: 0\.5",
+            r"scene t_intersection has steps of 0\.5 s, and traits are inferred in steps of 0\.1 s",
         ),
     ],
 )

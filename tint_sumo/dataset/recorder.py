@@ -11,12 +11,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from tint_sumo.config import STEP_S, AnyMix, Mix, Population
-from tint_sumo.core.errors import InputError
 from tint_sumo.core.structures import plain
 from tint_sumo.dataset.schema import SCHEMA_VERSION, Manifest
 from tint_sumo.dataset.shards import EPISODE_STEPS, record_dataset, require_sizes
 from tint_sumo.jobs import Workers
-from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene, paper_scene
+from tint_sumo.scenes import T_INTERSECTION, Scene, described, find_scene, paper_scene, require_trait_steps
 from tint_sumo.scenes.drivers import find_population, population_name
 from tint_sumo.scenes.geometry import Floats, Numbers
 from tint_sumo.simulation.scene import SceneSimulation
@@ -39,11 +38,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         require_sizes(self.windows, self.seed)
-        if self.played().step_s != STEP_S:
-            raise InputError(
-                f"windows consist of steps of {STEP_S:g} s, but the scene {self.scene.name} has step_s: "
-                f"{self.scene.step_s:g}; leave it out"
-            )
+        require_trait_steps(self.scene)
 
     def played(self) -> Scene:
         scene = self.scene

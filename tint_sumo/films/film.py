@@ -12,6 +12,7 @@ from PIL import Image, ImageColor
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import require_output_file, whole_file
 from tint_sumo.core.progress import Progress, Report, silent
+from tint_sumo.core.sampling import evenly_spread
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.rendering import RENDER_FPS
 from tint_sumo.films.driving import Driven, Moment, drive_case
@@ -116,9 +117,9 @@ def require_film_file(out: Path) -> None:
 
 
 def _spread(moments: Sequence[Moment]) -> list[Moment]:
-    """Return as many moments as a strip shows, evenly spread, the first and the last among them."""
+    """Return at most as many moments as a strip shows, evenly spread, the first and the last among them."""
     across, down = _STRIP
-    return [moments[index] for index in np.linspace(0, len(moments) - 1, across * down).round().astype(int).tolist()]
+    return [moments[index] for index in evenly_spread(len(moments), across * down).tolist()]
 
 
 def _frames(artist: _Artist, moments: Sequence[Moment], report: Report) -> Iterator[Image.Image]:

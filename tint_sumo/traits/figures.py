@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.config import NO_LEADER_GAP_M, STEP_S, WINDOW_STEPS, VehicleShape
 from tint_sumo.core.files import whole_file
+from tint_sumo.core.sampling import evenly_spread
 from tint_sumo.dataset.inspection import Colour
 from tint_sumo.dataset.windows import Windows
 from tint_sumo.traits.evaluation import encode_windows
@@ -118,8 +119,7 @@ def _numbered(
         mine = np.flatnonzero((kind == trait) & (windows.length == WINDOW_STEPS))
         widest = latents[mine].var(axis=0).argmax() if len(mine) else 0
         ordered = mine[np.argsort(latents[mine, widest], kind="stable")]
-        count = min(NUMBERED // len(kinds), len(ordered))
-        chosen.extend(ordered[np.linspace(0, len(ordered) - 1, count).round().astype(int)] if count else [])
+        chosen.extend(ordered[evenly_spread(len(ordered), NUMBERED // len(kinds))])
     return np.array(chosen, np.int64)
 
 

@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from tint_sumo.config import Mix
 from tint_sumo.core.percentages import percent
+from tint_sumo.core.sampling import evenly_spread
 from tint_sumo.methods.registry import Look
 from tint_sumo.study.jobs import smoothed_percent
 from tint_sumo.study.summary import (
@@ -92,7 +92,7 @@ def curve_chart(curves: Mapping[tuple[str, Mix], Sequence[pd.DataFrame]]) -> Cha
         line = _marks(at, _rounded(middle.to_numpy()), title, look)
         line["marker"]["maxdisplayed"] = 8
         traces.append({**line, "mode": "lines+markers", "line": _line(look)})
-        for row in np.unique(np.linspace(0, len(at) - 1, _CURVE_LINES).round().astype(int)):
+        for row in evenly_spread(len(at), _CURVE_LINES):
             span = _span((low.iloc[row] / 100.0, high.iloc[row] / 100.0)) if len(seeds) > 1 else "-"
             lines.append([title, f"{at[row]:,.0f}", percent(middle.iloc[row] / 100.0), span])
     layout = {

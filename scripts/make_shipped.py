@@ -144,10 +144,10 @@ def rows_of_strangers() -> list[StoredRow]:
         rates = {outcome: Rate(round(count), cases * len(seeds)) for outcome, count in counts.items()}
         rows.append(
             StoredRow(
-                method,
+                str(method),
                 TRAINED if is_trained else GIVEN,
                 ALL_MIXES if is_trained else None,
-                Conditions(ALL_MIXES, world=world),
+                Conditions(ALL_MIXES, world=str(world)),
                 seeds,
                 paper_scene().tau_s,
                 cases,

@@ -58,7 +58,7 @@ def times_s(nodes: int) -> tuple[float, float]:
         with ray_cluster(cluster.address) as found:
             return recording_s(found), evaluation_s(found)
     finally:
-        cluster.shutdown()
+        cluster.shutdown()  # type: ignore[no-untyped-call]  # Ray has no types here
 
 
 def main() -> None:

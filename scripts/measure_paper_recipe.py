@@ -63,7 +63,7 @@ def rows_of(budget: str, folder: Path, cases: int) -> Iterator[dict[str, object]
             **training_of(budget, card),
             "percent": percent,
             "decisions": card.get("decisions", card["steps"]),
-            **{name: value for name, value in shares.items() if name != "world"},
+            **{str(name): value for name, value in shares.items() if name != "world"},
             **dict(zip(names, published, strict=False)),
         }
 
@@ -97,7 +97,8 @@ def plot(curves: pandas.DataFrame, file: Path) -> None:
     for axes in all_axes[len(panels) :]:
         axes.set_visible(False)
     for axes, ((method, p_conservative), found) in zip(all_axes, panels, strict=False):
-        for (budget, _), curve in found.groupby(["budget", "seed"], sort=False):
+        for (name, _), curve in found.groupby(["budget", "seed"], sort=False):
+            budget = str(name)
             hours = curve["decisions"] * PPO_BUDGETS[budget].action_repeat * STEP_S / 3600.0
             colour, title = LOOKS[budget]
             for outcome, line in LINES.items():

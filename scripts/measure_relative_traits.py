@@ -22,6 +22,7 @@ from tint_sumo.core.determinism import single_threaded
 from tint_sumo.core.files import write_text
 from tint_sumo.scenes import T_INTERSECTION
 from tint_sumo.traits import load
+from tint_sumo.traits.cross_window import CrossWindow
 from tint_sumo.traits.perceived import Perceived
 from tint_sumo.traits.relative_fit import traffic_in
 from tint_sumo.traits.relative_reading import Reading, Readings, beliefs, read
@@ -34,7 +35,9 @@ TEST_SEED = 1_000_000  # of the traffic of tests
 def one_driver(seen: Perceived) -> np.ndarray:
     """Return mean and standard deviation of the cross-window model's posteriors (T, N, V, 4)."""
     _, envs, slots = seen.present.shape
-    stream, tracks = TrackStream(load("cross_window"), envs * slots), np.arange(envs * slots).reshape(envs, slots)
+    model = load("cross_window")
+    assert isinstance(model, CrossWindow)
+    stream, tracks = TrackStream(model, envs * slots), np.arange(envs * slots).reshape(envs, slots)
     found = np.zeros((*seen.present.shape, 4), np.float32)
     for step, present in enumerate(seen.present):
         stream.forget(tracks[~present | seen.begins[step][:, None]])

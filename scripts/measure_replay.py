@@ -317,8 +317,8 @@ def measure_street(folder: Path) -> Iterator[dict[str, object]]:
                         found = drive(simulation, scene, Ego(ego, scene), scene.ego.goal_m, at.step)
                         compared = compare(true[ego, start_s], found, recorded_x_m, at.step)
                         drives.setdefault((ego, kind), []).append((found.outcome, true[ego, start_s].outcome, compared))
-    for (ego, kind), found in drives.items():
-        yield row_of("street, recorded here", ego, kind, found)
+    for (ego, kind), outcomes in drives.items():
+        yield row_of("street, recorded here", ego, kind, outcomes)
 
 
 def measure_speed(folder: Path) -> None:

@@ -7,6 +7,7 @@ import csv
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ class DecidesOnce(TimeToCollision):
             gone &= ~episode_start
         is_there = np.ones(count, bool)
         if self.creeps:
-            front_m = self._geometry.ego_front_m(observation["ego"][:, :2] * 20.0)
+            front_m = self._geometry.ego_front_m((observation["ego"][:, :2] * 20.0).astype(np.float64))
             is_there = front_m >= self._geometry.enter_m[0] - self.line_margin_m - _AT_LINE_M
         gone |= is_there & (free == GO)
         wait = np.where(is_there, STOP, CREEP)
@@ -76,7 +77,7 @@ def creeping() -> Iterator[dict[str, Any]]:
         task = TaskSettings(scene, Mix(0.4), sensor=sensor)
         for creeps in (False, True):
             rule = DecidesOnce(threshold_s=CREEPING_THRESHOLD_S, creeps=creeps)
-            found = evaluate(rule, lambda count, task=task: policy_venv(count, None, [task]), CASES, REPORTED_SET)
+            found = evaluate(rule, partial(policy_venv, source=None, settings=[task]), CASES, REPORTED_SET)
             yield {"sensor": name, "decides": "at the lane" if creeps else "at the start", **_rates(found)}
 
 
@@ -86,12 +87,7 @@ def policies() -> Iterator[dict[str, Any]]:
         for policy in POLICIES:
             contender = load_policy(policy)
             task = replace(contender.task, p_conservative=ALL_MIXES, sensor=sensor)
-            found = evaluate(
-                contender.policy,
-                lambda count, contender=contender, task=task: contender.make_venv(count, task),
-                CASES,
-                REPORTED_SET,
-            )
+            found = evaluate(contender.policy, partial(contender.make_venv, task=task), CASES, REPORTED_SET)
             yield {"sensor": name, "policy": policy, **_rates(found)}
 
 

@@ -108,7 +108,7 @@ def worlds_lines(table: pandas.DataFrame) -> Lines:
 def scores_lines(table: pandas.DataFrame) -> Lines:
     """Return what the trainings of each method have reached over all worlds, seed by seed, in percent."""
     trained = table[table["trained_in"] == TRAINED_IN]
-    success = {method: _by_seed(found, "success") for method, found in trained.groupby("method", sort=False)}
+    success = {str(method): _by_seed(found, "success") for method, found in trained.groupby("method", sort=False)}
     lines = [
         [
             "method",

@@ -121,6 +121,9 @@ def _compare(mean: Floats, weight: Floats, gone: Floats) -> NDArray[np.float32]:
 class Beliefs(nn.Module):
     """Give the logit of yielding of drivers, (...), from the inputs (..., 27) of ``Comparison``."""
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(INPUTS))
@@ -162,7 +165,8 @@ def fit() -> Beliefs:
     model.mean.copy_(inputs.mean(dim=0))
     model.std.copy_(inputs.std(dim=0) + 1e-6)
     optimiser = torch.optim.Adam(model.parameters(), LEARNING_RATE, weight_decay=1e-5)
-    batches = [batch for _ in range(EPOCHS) for batch in torch.randperm(len(inputs), generator=generator).split(BATCH)]
+    orders = (torch.randperm(len(inputs), generator=generator) for _ in range(EPOCHS))
+    batches = [batch for order in orders for batch in torch.split(order, BATCH)]
     schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.01, len(batches))
     for batch in batches:
         loss = nn.functional.binary_cross_entropy_with_logits(model(inputs[batch]), yields[batch])

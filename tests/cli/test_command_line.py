@@ -50,6 +50,18 @@ def test_help_boxes_fit_the_terminal(
     assert max(map(len, boxes.splitlines())) == columns
 
 
+def test_nothing_else_is_done_behind_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version", "models"]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == f"tint-sumo {__version__}"
+
+
+def test_a_configuration_without_a_name_is_refused_as_other_flags_are(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["record", "--config"])
+    assert stop.value.code == 2
+    assert "Missing value for argument '--config'" in capsys.readouterr().err
+
+
 def test_versions_are_printed_at_once() -> None:
     script = (
         "import sys, tint_sumo.cli\n"
@@ -137,6 +149,7 @@ def test_argument_errors_exit_with_2(argv: list[str], capsys: pytest.CaptureFixt
         ("policy train --method oracle --out s3://bucket/run", "--out of this command is a path on this machine"),
         ("traits evaluate --data file:///data --model MODEL", "--data of this command is a path on this machine"),
         ("policy sweep --set n_epochs=2 --set gamma=0.9 --out OUT", "--set is given twice; give it once"),
+        ("policy evaluate --model ttc --p_conservative 0.1 --p-conservative=0.9", "--p-conservative is given twice"),
         ("study run --workers 0 --out OUT", "workers"),
         ("study report --out NOWHERE", "no results in"),
         ("render --model always_go --out film.avi", "film.avi must end in .mp4, .gif or .png"),

@@ -63,7 +63,10 @@ def test_the_script_is_printed_without_what_commands_need() -> None:
 @pytest.mark.parametrize("shell", SHELLS)
 def test_there_is_a_script_for_each_shell(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--print-completion", shell]) == 0
-    assert "tint-sumo" in capsys.readouterr().out
+    script = capsys.readouterr().out
+    assert "tint-sumo" in script
+    assert main(["--print-completion", shell, "models"]) == 0
+    assert capsys.readouterr().out == script
 
 
 def test_help_tells_of_it_and_other_shells_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

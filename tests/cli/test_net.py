@@ -1,5 +1,6 @@
 """``tint-sumo net``."""
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,14 @@ def test_net(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert printed["replicas"] == 2
     assert {Path(file).name for file in printed["files"]} >= {"tint.net.xml", "tint.sumocfg"}
     assert all(Path(file).is_file() for file in printed["files"])
+
+
+def test_the_command_that_runs_a_network_can_be_typed_as_it_stands(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["net", "--out", str(tmp_path / "my net")]) == 0
+    shown = capsys.readouterr().out.partition("run them with: ")[2]
+    assert shlex.split(shown) == ["sumo", "-c", str(tmp_path / "my net" / "tint.sumocfg")]
 
 
 def test_a_map_is_imported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -31,7 +31,7 @@ from tint_sumo.core.processes import end_quickly, interrupt_on_sigterm
 from tint_sumo.core.provenance import Origin, made_by, version_text
 from tint_sumo.core.ranges import require_ranges
 from tint_sumo.core.redaction import redact
-from tint_sumo.core.streams import READER_GONE, flushed_output, has_lost_reader, show_any_name
+from tint_sumo.core.streams import READER_GONE, flushed_output, has_lost_reader, open_closed_streams, show_any_name
 
 Shell = Literal["bash", "zsh", "tcsh"]
 _COMPLETION = arg(
@@ -73,6 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     end_quickly()
     interrupt_on_sigterm()
+    open_closed_streams()
     show_any_name()
     try:
         with flushed_output():
@@ -87,10 +88,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     """Run the command of a command line, and print its outcome."""
-    if words[:1] == ["--print-completion"] and words[1:] in ([shell] for shell in get_args(Shell)):
+    if words[:1] == ["--print-completion"] and words[1:2] in ([shell] for shell in get_args(Shell)):
         print(_completion_script(words[1]), end="")
         return 0
-    if words == ["--version"]:
+    if words[:1] == ["--version"]:
         print(version_text())
         return 0
     command = Command()
@@ -158,7 +159,7 @@ def _with_build(words: list[str]) -> list[str]:
 
 def _require_each_once(words: Sequence[str]) -> None:
     """Raise InputError if a flag comes twice: the values behind the first would be ignored in silence."""
-    flags = [word.partition("=")[0] for word in words if word.startswith("--")]
+    flags = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]  # tyro takes both
     for flag in flags:
         if flags.count(flag) > 1:
             raise InputError(f"{flag} is given twice; give it once, with all of its values behind it")

@@ -55,7 +55,7 @@ def name_flag(*names: str) -> PrimitiveConstructorSpec[Any]:
 def config_of(words: Sequence[str]) -> Path | None:
     """Return the configuration file that the words of a command line name."""
     parser = argparse.ArgumentParser(prog="tint-sumo", add_help=False, allow_abbrev=False)
-    parser.add_argument(CONFIG_FLAG, type=Path)
+    parser.add_argument(CONFIG_FLAG, type=Path, nargs="?")  # tyro says that its value is missing
     found: Path | None = parser.parse_known_args(words)[0].config
     return found
 

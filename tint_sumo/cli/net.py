@@ -2,6 +2,7 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, Suppress, subcommand
@@ -37,7 +38,7 @@ class BuildNet(Command):
 
         scene = require_built_in("a network", find_scene(self.scene))
         files = write_scene(self.out, scene, self.replicas)
-        text = f"wrote {len(files)} files to {self.out}; run them with: sumo -c {self.out / CONFIG_FILE}"
+        text = f"wrote {len(files)} files to {self.out}; run them with: sumo -c {quote(str(self.out / CONFIG_FILE))}"
         return Outcome(text, {"replicas": self.replicas, "files": [str(file) for file in files]})
 
 

@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from shlex import quote
 from typing import Any
 from xml.etree import ElementTree
 
@@ -177,7 +178,7 @@ def _ask_sumo(file: Path) -> list[tuple[str, str, str]]:
 
 def refused(problem: str, file: Path) -> InputError:
     """Return the error that SUMO has a problem with a configuration, with the way to see it."""
-    return InputError(f"SUMO {problem}; try it with: sumo -c {file}")
+    return InputError(f"SUMO {problem}; try it with: sumo -c {quote(str(file))}")
 
 
 def first_reason(printed: str) -> str:

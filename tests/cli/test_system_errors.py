@@ -86,6 +86,15 @@ def test_a_closed_pipe_of_stderr_ends_the_work(closed_pipe: int, tmp_path: Path)
     assert not list(tmp_path.rglob("*.partial"))
 
 
+@pytest.mark.parametrize("closed", [1, 2], ids=["stdout", "stderr"])
+def test_a_command_works_where_it_was_started_with_closed_output(closed: int, tmp_path: Path) -> None:
+    command = f"exec {sys.executable} -m tint_sumo.cli record --windows 50 --out {tmp_path / 'data'} {closed}>&-"
+    ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0
+    assert bool(ended.stdout) == (closed == 2)
+    assert (tmp_path / "data" / "manifest.json").exists()
+
+
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("argv", ["--help", "record --out x --print-config", "dataset inspect DATA"])
 def test_output_that_cannot_be_written_is_an_error(argv: str, unbuffered: str, dataset: Path) -> None:

@@ -6,9 +6,16 @@ import select
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TextIO
 
 READER_GONE = 141  # exit code of a program that a closed pipe ends: 128 + SIGPIPE
+
+
+def open_closed_streams() -> None:
+    """Let output go nowhere where the program was started with a closed stdout or stderr; Python has None there."""
+    sys.stdout = sys.stdout or _nowhere()
+    sys.stderr = sys.stderr or _nowhere()
 
 
 def show_any_name() -> None:
@@ -28,8 +35,11 @@ def flushed_output() -> Iterator[None]:
         yield
     finally:
         for stream in (sys.stdout, sys.stderr):
-            if stream is not None:  # it is where the command was started with a closed one
-                _flush(stream)
+            _flush(stream)
+
+
+def _nowhere() -> TextIO:
+    return Path(os.devnull).open("w", encoding="utf-8")
 
 
 def _flush(stream: TextIO) -> None:
@@ -42,7 +52,7 @@ def _flush(stream: TextIO) -> None:
 
 def has_lost_reader() -> bool:
     """Return whether stdout or stderr is a pipe from which nobody reads any more."""
-    return any(_has_no_reader(stream) for stream in (sys.stdout, sys.stderr) if stream is not None)
+    return any(_has_no_reader(stream) for stream in (sys.stdout, sys.stderr))
 
 
 def _has_no_reader(stream: TextIO) -> bool:

@@ -16,7 +16,7 @@ from tests.terminal import look, open_terminal
 from tests.waiting import PATIENCE_S
 from tint_sumo.core.progress import Progress
 from tint_sumo.jobs.status import Overview, Status, duration
-from tint_sumo.jobs.table import JobTable, Log, one_job, render
+from tint_sumo.jobs.table import JobTable, Log, one_job, render, report_line
 
 TRAIN, OTHER, TRAITS = "train no_labels-P0.1to0.9-seed0", "train ma-P0.4-seed3", "traits vae"
 HIDE, SHOW = "\x1b[?25l", "\x1b[?25h"  # the cursor
@@ -119,6 +119,7 @@ def test_a_log_has_a_line_for_each_begin_and_end_and_one_a_minute_for_all() -> N
         f"{TRAIN}: 30%, 1 steps/s, 2 min left, success 50%; "
         "traits vae: 30%, 1 steps/s, 2 min left, success 50%"
     )
+    assert report_line(Overview(1, [], {TRAIN: Status(0.0)}), 1.0) == TRAIN, "which has not reported yet"
     assert lines[-2:] == [
         f"{TRAIN}: success 50% (3 min)",
         "traits vae: 98% of windows right (3 min)",

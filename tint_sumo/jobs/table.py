@@ -224,4 +224,5 @@ def report_line(overview: Overview, now_s: float) -> str:
 def _sentence(name: str, status: Status, now_s: float) -> str:
     text = status.text(now_s)
     left = f"{text.left} left" if text.left else ""
-    return f"{name}: " + ", ".join(part for part in (text.percent, text.speed, left, text.outcomes) if part)
+    known = ", ".join(part for part in (text.percent, text.speed, left, text.outcomes) if part)
+    return f"{name}: {known}" if known else name

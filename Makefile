@@ -62,4 +62,4 @@ dist: install
 	$(BIN)/check-wheel-contents $(DIST)/*.whl
 
 clean:
-	rm -rf runs build dist .coverage* .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf build dist .coverage* .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -7,6 +7,7 @@ RUNS is a folder of training runs BUDGET.METHOD.SEED, such as ``tint-sumo policy
 --p-conservative 0.4 --seed 0 --out RUNS/paper.oracle.0`` makes; with BUDGET "full" they have our recipe. Each policy is
 tested in the mix that it was trained for, after 25, 50 and 100 % of its training. Table and curves keep the rows that
 they have already of other trainings, so trainings can be made one by one. With --figure, all curves are drawn.
+A method that shares another's training, as Ma's shares the oracle's, is tested with it, from a folder beside it.
 """
 
 import argparse
@@ -24,7 +25,8 @@ from tint_sumo.core.sampling import evenly_spread
 from tint_sumo.core.weights import card_file
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.methods.evaluation import REPORTED_SET
-from tint_sumo.methods.training import CURVE_FILE, snapshot_stem
+from tint_sumo.methods.registry import METHODS, Learned
+from tint_sumo.methods.training import CURVE_FILE, share_training, snapshot_stem
 from tint_sumo.policy.storage import read_policy_card
 from tint_sumo.study.published import RATES_PERCENT
 
@@ -41,6 +43,15 @@ def finished(runs: Path) -> Iterator[tuple[str, Path]]:
         budget = folder.name.split(".")[0]
         if budget in LOOKS and card_file(snapshot_stem(folder, 100)).exists():
             yield budget, folder
+
+
+def share_trainings(runs: Path) -> None:
+    """Write policies of methods that share a finished training beside it."""
+    for budget, folder in list(finished(runs)):
+        card = read_policy_card(snapshot_stem(folder, 100))
+        for method in METHODS.values():
+            if isinstance(method, Learned) and method.trained_as == card["method"]:
+                share_training(folder, method.name, runs / f"{budget}.{method.name}.{card['seed']}")
 
 
 def training_of(budget: str, card: Mapping[str, Any]) -> dict[str, object]:
@@ -122,8 +133,10 @@ def main() -> None:
     parser.add_argument("--figure", type=Path)
     given = parser.parse_args()
     rows, curves = [], []
+    share_trainings(given.runs)
     for budget, folder in finished(given.runs):
-        curves.append(curve_of(budget, folder))
+        if (folder / CURVE_FILE).exists():  # there is none where a training is shared
+            curves.append(curve_of(budget, folder))
         for row in rows_of(budget, folder, given.cases):
             rows.append(row)
             print(*row.values(), flush=True)

@@ -115,7 +115,7 @@ def test_argument_errors_exit_with_2(argv: list[str], capsys: pytest.CaptureFixt
         ("traits evaluate --data DATA --model MODEL --noise nan", "noise must lie in 0 to 1000"),
         ("traits evaluate --data DATA --model nobody", "no trait model nobody"),
         ("traits infer --fcd NOWHERE --model MODEL --out OUT.csv", "floating-car data: no file"),
-        ("traits infer --fcd MODEL --model MODEL --out MODEL", "holds the data themselves"),
+        ("traits infer --fcd MODEL --model MODEL --out MODEL", "holds the data that are read"),
         ("traits infer --fcd DATA --model nobody --out OUT.csv", "no trait model nobody"),
         ("traits infer --fcd DATA --model MODEL --out OUT", "must end in .csv or .parquet"),
         ("traits infer --fcd DATA --model MODEL --out MODEL/table.csv", "cannot be a file there"),

@@ -55,6 +55,18 @@ def test_export_writes_vtypes_population_and_picture(fit: Path, tmp_path: Path) 
     assert (tmp_path / "drivers.add.xml").read_text().count("<vType ") == 3
 
 
+def test_export_replaces_its_own_files_alone(fit: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["drivers", "export", str(fit), "--out", str(tmp_path), "--size", "2"]
+    assert main(words) == main(words) == 0
+    capsys.readouterr()
+    for name in ("drivers.add.xml", "population.yaml"):
+        own = (tmp_path / name).read_text()
+        write_text(tmp_path / name, "precious")
+        assert f"{name} that tint-sumo did not write; choose another --out" in refuse(capsys, *words)
+        assert (tmp_path / name).read_text() == "precious"
+        write_text(tmp_path / name, own)
+
+
 def test_check_prints_the_distances(fit: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["drivers", "check", str(fit), "--recording", str(fit.parent / "recording"), "--repeats", "1", "--json"]
     assert main(words) == 0

@@ -90,6 +90,21 @@ def test_a_run_is_not_written_into_by_others(name: str, run: Path, capsys: pytes
     assert contents(run) == before
 
 
+@pytest.mark.parametrize(
+    "call_of", ["tracks match DATA net.xml --out OUT", "traits infer --tracks DATA --model vae --out OUT"]
+)
+def test_a_recording_is_not_replaced_by_a_table(
+    call_of: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording, link = tmp_path / "recording.csv", tmp_path / "link.csv"
+    write_text(recording, "precious")
+    link.symlink_to(recording)
+    for out in (recording, link):
+        assert call(call_of, out, recording) == 2
+        assert "holds the data that are read; choose another --out" in capsys.readouterr().err
+    assert recording.read_text() == "precious"
+
+
 def test_a_link_into_a_run_is_seen_through(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "link.png").symlink_to(run / "figure.png")
     (tmp_path / "folder").symlink_to(run)

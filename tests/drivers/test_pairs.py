@@ -1,5 +1,6 @@
 """Leaders and followers are found in tracks of any format."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from tests.drivers.recordings import HEADER, population, simulated_pair, write_pair, write_pairs
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
+from tint_sumo.drivers.models import Floats
 from tint_sumo.drivers.pairs import Recorded, find_pairs, left_out_text, read_pairs
 from tint_sumo.tracks.schema import build_tracks
 
@@ -58,6 +60,45 @@ def test_leaders_are_found_along_a_bend_on_the_same_lane() -> None:
     np.testing.assert_allclose(gaps["a", "b"].gap_m, 40.0 + 2.0 * time_s - 4.0, atol=0.3)
     np.testing.assert_allclose(gaps["a", "b"].speed_mps, 10.0)
     np.testing.assert_allclose(gaps["a", "b"].leader_speed_mps, 12.0)
+
+
+def on_a_street(
+    vehicles: Mapping[str, tuple[Floats, Floats]], time_s: Floats, noise_m: float = 0.0, **columns: Any
+) -> Recorded:
+    """Pairs of vehicles on a straight street: id, metres along it, and speed; positions err by ``noise_m``."""
+    rng = np.random.default_rng(0)
+    rows = len(time_s) * len(vehicles)
+    table = {
+        "vehicle": np.repeat(list(vehicles), len(time_s)),
+        "time_s": np.tile(time_s, len(vehicles)),
+        "x_m": np.concatenate([x_m for x_m, _ in vehicles.values()]) + rng.normal(0.0, noise_m, rows),
+        "y_m": rng.normal(0.0, noise_m, rows),
+        "speed_mps": np.concatenate([speed_mps for _, speed_mps in vehicles.values()]),
+    }
+    sizes = {"recording": "street", "heading_rad": 0.0, "length_m": 4.0, "width_m": 1.8, "vehicle_class": "car"}
+    return find_pairs(build_tracks(Path("street.csv"), "levelx", {**sizes, **table, **columns}))
+
+
+def test_noise_in_a_queue_changes_no_gap_and_no_way() -> None:
+    time_s = 0.04 * np.arange(2000)
+    speed_mps = np.interp(time_s, [0.0, 10.0, 15.0, 60.0, 70.0], [10.0, 10.0, 0.0, 0.0, 10.0])
+    x_m = np.cumsum(speed_mps) * 0.04
+    later_m = np.interp(time_s - 2.0, time_s, x_m) - 10.0
+    later_mps = np.interp(time_s - 2.0, time_s, speed_mps)
+    (pair,) = on_a_street({"a": (x_m, speed_mps), "b": (later_m, later_mps)}, time_s, noise_m=0.05).pairs
+    at_s = pair.step_s * np.arange(pair.rows)
+    np.testing.assert_allclose(pair.front_m - 2.0, np.interp(at_s, time_s, later_m - later_m[0]), atol=0.5)
+    before = at_s < 70.0  # later on the follower's own way, which the gap is measured along, ends before the leader
+    np.testing.assert_allclose(pair.gap_m[before], np.interp(at_s, time_s, x_m - later_m - 4.0)[before], atol=0.5)
+
+
+def test_vehicles_that_come_back_have_no_other_units() -> None:
+    once_s = 0.1 * np.arange(100)
+    time_s = np.concatenate([once_s, 120.0 + once_s, 240.0 + once_s])
+    x_m, speed_mps = np.tile(12.0 * once_s, 3), np.full(300, 12.0)
+    found = on_a_street({"a": (x_m, speed_mps), "b": (x_m - 25.0, speed_mps)}, time_s)
+    assert [(pair.start_s, pair.rows) for pair in found.pairs] == [(0.0, 100), (120.0, 100), (240.0, 100)]
+    assert found.inconsistent == 0
 
 
 def test_who_drives_the_other_way_or_walks_is_no_leader() -> None:

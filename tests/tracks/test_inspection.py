@@ -56,6 +56,13 @@ def test_jumps_are_counted() -> None:
     assert inspect(made(*rows)).faults.jumps == 0
 
 
+def test_a_vehicle_that_comes_back_later_has_no_other_units() -> None:
+    later = [(name, time_s + 100.0, *rest) for name, time_s, *rest in drive("a", [10.0] * 20)]
+    found = inspect(made(*drive("a", [10.0] * 20), *later))
+    assert found.distance_ratio == pytest.approx(1.0)
+    assert found.faults.long_steps == 1
+
+
 def test_missing_frames_are_counted() -> None:
     rows = drive("a", [10.0] * 8)
     del rows[3]

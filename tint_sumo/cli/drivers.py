@@ -10,7 +10,6 @@ from tint_sumo.cli.command import RESUMES, Command, Outcome, wrote
 from tint_sumo.cli.tracks import TrackFormatName
 from tint_sumo.cli.values import optional
 from tint_sumo.config import STEP_S, StepS, TrafficSeed
-from tint_sumo.core.files import require_output_folder
 from tint_sumo.core.ranges import Range
 
 _SPEED_LIMIT = optional(
@@ -77,7 +76,6 @@ class ExportDrivers(Command):
         from tint_sumo.drivers.export import export
         from tint_sumo.drivers.fitted import read_fitted
 
-        require_output_folder(self.out)
         files = export(read_fitted(self.fitted), self.out, self.size, self.seed, self.speed_limit)
         names = list(map(str, files))
         return Outcome("\n".join(wrote(names)), {"files": names})

@@ -67,7 +67,7 @@ class MatchTracks(Command):
         from tint_sumo.tracks.matching import write_table
 
         if self.out is not None:
-            require_output_file(self.out, _TABLE_SUFFIXES)
+            require_output_file(self.out, _TABLE_SUFFIXES, inputs=(self.tracks, self.net))
         if self.figure is not None:
             require_output_file(self.figure, PICTURE_SUFFIXES, "figure")
         matched = match(read_tracks(self.tracks, self.format), self.net, self.shift_m)

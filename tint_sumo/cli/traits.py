@@ -264,9 +264,7 @@ class InferTraits(Command):
         )
 
         source = require_one(fcd=self.fcd, tracks=self.tracks)
-        if self.out.exists() and source.exists() and self.out.samefile(source):
-            raise InputError(f"{self.out} holds the data themselves; choose another --out")
-        require_output_file(self.out, SUFFIXES)
+        require_output_file(self.out, SUFFIXES, inputs=(source,))
         use_one_thread()
         if self.tracks is not None:
             if self.net is not None or self.vtypes is not None:

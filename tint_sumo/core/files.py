@@ -148,13 +148,24 @@ def damaged(path: Path, what: str, error: object) -> InputError:
     return InputError(f"{what}: {path} is damaged ({error}); restore it, or remove it and repeat the command")
 
 
-def require_output_file(file: Path, suffixes: Sequence[str], argument: str = "out") -> None:
+def require_output_file(
+    file: Path, suffixes: Sequence[str], argument: str = "out", inputs: Sequence[Path] = ()
+) -> None:
     """Check, before the work begins, that a command can write a file, and may.
 
+    Args:
+        file: to write.
+        suffixes: that it may have.
+        argument: what users call it.
+        inputs: files that the command reads, which need not be there.
+
     Raises:
-        InputError: the suffix is none of these, no file can be there, or it lies in the folder of a run.
+        InputError: the file is one of the inputs, the suffix is none of these, no file can be there, or it lies in the
+            folder of a run.
         OSError: the folder cannot be written to, or has no room.
     """
+    if any(file.exists() and read.exists() and file.samefile(read) for read in inputs):
+        raise InputError(f"{file} holds the data that are read; choose another `{argument}`")
     if file.suffix.lower() not in suffixes:
         allowed = " or ".join(part for part in (", ".join(suffixes[:-1]), suffixes[-1]) if part)
         raise InputError(f"{file} must end in {allowed}; choose another `{argument}`")
@@ -175,6 +186,17 @@ def require_output_folder(folder: Path, argument: str = "out") -> None:
         raise InputError(f"{folder} is a file, not a folder, or lies below one; choose another `{argument}`")
     _require_no_run(folder, argument)
     _require_writable(folder, argument)
+
+
+def require_own_files(files: Sequence[Path], mark: str) -> None:
+    """Check that files which a command writes are not there yet, or are from it.
+
+    Raises:
+        InputError: the text of one lacks the mark that the command puts into it.
+    """
+    for file in files:
+        if file.exists() and mark not in file.read_text(encoding="utf-8", errors="replace"):
+            raise InputError(f"{file.parent} holds a {file.name} that tint-sumo did not write; choose another `out`")
 
 
 def _require_no_run(path: Path, argument: str) -> None:

@@ -10,7 +10,7 @@ from matplotlib.ticker import LogLocator
 from scipy.stats import norm
 
 from tint_sumo.config import FittedDriver, Idm
-from tint_sumo.core.files import whole_file, write_text
+from tint_sumo.core.files import require_output_folder, require_own_files, whole_file, write_text
 from tint_sumo.core.structures import plain
 from tint_sumo.core.yaml_files import to_yaml
 from tint_sumo.drivers.fitted import Fitted
@@ -20,6 +20,7 @@ from tint_sumo.drivers.replay import vtype_xml
 
 DISTRIBUTION_ID = "drivers"
 VTYPES_FILE, POPULATION_FILE, PICTURE_FILE = "drivers.add.xml", "population.yaml", "drivers.png"
+_VTYPES_NOTE, _POPULATION_NOTE = "Fitted with a step length", "Drivers that were fitted to a recording"
 _RECORDED, _DEFAULT = "#2a6f97", "#c1121f"  # colours
 _OUTER = 0.001  # quantiles between which densities are drawn
 
@@ -36,7 +37,13 @@ def export(fitted: Fitted, out: Path, size: int, seed: int, speed_limit_mps: flo
 
     Returns:
         the files.
+
+    Raises:
+        InputError: a file of the same name exists that this function did not write, or the folder is a run's.
     """
+    require_output_folder(out)
+    require_own_files([out / VTYPES_FILE], _VTYPES_NOTE)
+    require_own_files([out / POPULATION_FILE], _POPULATION_NOTE)
     model = fitted.car_following
     drawn = draws(model, fitted.population.population.any_pair, size, seed)
     write_text(out / VTYPES_FILE, vtypes_xml(model, drawn, fitted.step_s, speed_limit_mps))
@@ -59,7 +66,7 @@ def vtypes_xml(model: CarFollowing, drawn: Floats, step_s: float, speed_limit_mp
         f"        {vtype_xml(f'{DISTRIBUTION_ID}.{index}', model.vtype(z, speed_limit_mps))}"
         for index, z in enumerate(drawn)
     )
-    note = f"    <!-- Fitted with a step length of {step_s:g} s; headways below the step length cannot be kept. -->"
+    note = f"    <!-- {_VTYPES_NOTE} of {step_s:g} s; headways below the step length cannot be kept. -->"
     head = f'    <vTypeDistribution id="{DISTRIBUTION_ID}">'
     return "\n".join(["<additional>", note, head, *types, "    </vTypeDistribution>", "</additional>", ""])
 
@@ -78,7 +85,7 @@ def population_yaml(model: CarFollowing, drawn: Floats) -> str:
         "fitted": [plain(driver) for driver in drivers],
     }
     note = (
-        "Drivers that were fitted to a recording: they keep their headway, minimum gap, acceleration and braking. "
+        f"{_POPULATION_NOTE}: they keep their headway, minimum gap, acceleration and braking. "
         "How fast they want to go, whether they yield and how they enter is as in the population's base."
     )
     return to_yaml({"population": {"base": "traits", **population}}, {"population": note})

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from tint_sumo.config import STEP_S
 from tint_sumo.core.compiling import compiled
 from tint_sumo.core.errors import InputError
-from tint_sumo.tracks.inspection import jumping_rows
+from tint_sumo.tracks.motion import SAME_UNITS, Steps, steps_of
 from tint_sumo.tracks.reading import formats_of, read_tracks
-from tint_sumo.tracks.schema import Tracks
+from tint_sumo.tracks.schema import Tracks, is_on_foot
 
 Floats = NDArray[np.float64]
 
@@ -29,13 +29,10 @@ MIN_DURATION_S = 1.0
 REACH_M = 150.0  # a leader farther away is none, except in files that name the leader
 _STRAIGHT_M = 20.0  # a way goes on so far in a straight line where its track ends
 _SAME_DIRECTION_RAD = math.radians(60.0)
-_LONG_STEP = 1.5  # times the usual step of a recording: frames are missing
 _MOVED_M = 20.0  # units are compared where a vehicle has moved so far
-_SAME_UNITS = (0.8, 1.25)  # of the distance driven to the speed times the time
 _FEW_JUMPS = 0.05  # share of a track's rows
 _MOST_WRONG = 0.1  # share of tracks whose units may disagree: mistakes of a tracker
 _SUFFIXES = (".csv", ".xml", ".parquet", ".txt", ".gz")
-_ON_FOOT = ("pedestrian", "bicycle", "cyclist", "person", "animal", "wheelchair")  # classes without car-following
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,20 +170,21 @@ def find_pairs(
 ) -> Recorded:
     """Find the pairs in some tracks; see ``read_pairs``."""
     table, track = tracks.table, tracks.track_number
+    steps = steps_of(tracks)
+    driven_m, wrong = _driven_m(track, steps), _inconsistent(tracks, track, steps)
     time_s, x_m, y_m, heading_rad, speed_mps, length_m, width_m = (
         table[name].to_numpy() for name in ("time_s", "x_m", "y_m", "heading_rad", "speed_mps", "length_m", "width_m")
     )
-    driven_m, jumping = _driven_m(track, x_m, y_m), jumping_rows(tracks)
-    wrong = _inconsistent(tracks, track, time_s, speed_mps, driven_m, jumping)
     drives = ~np.isin(track, wrong) & ~_on_foot(table)
     rows, begins = _by_moment(table, drives)
     named = tracks.format == "leader_follower"
     reach_m, straight_m = (math.inf, math.inf) if named else (REACH_M, _STRAIGHT_M)
     leader, ahead_m = np.full(len(track), -1, np.int64), np.zeros(len(track))
-    _find_leaders(rows, begins, track, x_m, y_m, heading_rad, length_m, width_m, reach_m, straight_m, leader, ahead_m)
+    way = (track, x_m, y_m, heading_rad, driven_m)
+    _find_leaders(rows, begins, *way, length_m, width_m, reach_m, straight_m, leader, ahead_m)
     pairs, short = [], 0
     names = [table[name].astype(str).to_numpy() for name in ("recording", "vehicle")]
-    for first, last in _stretches(track, time_s, leader, jumping):
+    for first, last in _stretches(track, leader, steps):
         own, other = slice(first, last), leader[first:last]
         free = other[0] < 0
         if free and (named or not with_free or not drives[first]):
@@ -206,54 +204,41 @@ def find_pairs(
             short += 1
         else:
             pairs.append(_at_step(pair, time_s[own]))
-    return Recorded(tuple(pairs), (tracks.file,), (), short, len(wrong), len(jumping))
+    return Recorded(tuple(pairs), (tracks.file,), (), short, len(wrong), int(steps.is_jump.sum()))
 
 
 def _on_foot(table: pd.DataFrame) -> NDArray[np.bool_]:
-    classes = table["vehicle_class"].str.lower()
-    return np.asarray(np.logical_or.reduce([classes.str.contains(name, regex=False) for name in _ON_FOOT]), np.bool_)
+    return table["vehicle_class"].map(is_on_foot).to_numpy(np.bool_)
 
 
-def _driven_m(track: NDArray[np.int64], x_m: Floats, y_m: Floats) -> Floats:
+def _driven_m(track: NDArray[np.int64], steps: Steps) -> Floats:
     """Return the distance that each vehicle has driven since its track began; (M,)."""
-    steps_m = np.hypot(np.diff(x_m, prepend=x_m[:1]), np.diff(y_m, prepend=y_m[:1]))
-    begins = np.diff(track, prepend=-1) != 0
-    steps_m[begins] = 0.0
+    steps_m = np.zeros(len(track))
+    steps_m[steps.row] = steps.driven_m
     driven_m = np.cumsum(steps_m)
-    return np.asarray(driven_m - driven_m[begins][track])
+    return np.asarray(driven_m - driven_m[np.flatnonzero(np.diff(track, prepend=-1))][track])
 
 
-def _inconsistent(
-    tracks: Tracks,
-    track: NDArray[np.int64],
-    time_s: Floats,
-    speed_mps: Floats,
-    driven_m: Floats,
-    jumping: NDArray[np.int64],
-) -> NDArray[np.int64]:
+def _inconsistent(tracks: Tracks, track: NDArray[np.int64], steps: Steps) -> NDArray[np.int64]:
     """Return the numbers of tracks on which vehicles move farther or less far than their speeds say.
 
-    Single jumps do not count; where there are many, the units are wrong.
+    Missing frames do not count, nor do single jumps; where there are many, the units are wrong.
 
     Raises:
         InputError: there are so many such tracks that the units must be mixed.
     """
-    begins = np.flatnonzero(np.diff(track, prepend=-1))
-    rows = np.diff(np.append(begins, len(track)))
-    expected_m = np.diff(time_s, prepend=0.0) * (speed_mps + np.roll(speed_mps, 1)) / 2.0
-    steps_m = np.diff(driven_m, prepend=0.0)
-    single = jumping[
-        np.bincount(track[jumping], minlength=len(rows))[track[jumping]] <= _FEW_JUMPS * rows[track[jumping]]
-    ]
-    ignored = np.concatenate([begins, single])
-    steps_m[ignored] = expected_m[ignored] = 0.0
-    moved_m, expected_m = np.add.reduceat(steps_m, begins), np.add.reduceat(expected_m, begins)
+    rows, own = np.bincount(track), track[steps.row]
+    single = steps.is_jump & (np.bincount(own[steps.is_jump], minlength=len(rows)) <= _FEW_JUMPS * rows)[own]
+    counts = ~(steps.is_long | single)
+    moved_m, expected_m = (
+        np.bincount(own[counts], way_m[counts], len(rows)) for way_m in (steps.driven_m, steps.speed_mps * steps.time_s)
+    )
     judged = np.maximum(expected_m, moved_m) > _MOVED_M
     ratio = moved_m / np.maximum(expected_m, 1e-9)
-    wrong = judged & ~((ratio >= _SAME_UNITS[0]) & (ratio <= _SAME_UNITS[1]))
+    wrong = judged & ~((ratio >= SAME_UNITS[0]) & (ratio <= SAME_UNITS[1]))
     if wrong.sum() > _MOST_WRONG * judged.sum():
         worst = np.flatnonzero(wrong)[0]
-        vehicle = tracks.table["vehicle"].iloc[begins[worst]]
+        vehicle = tracks.table["vehicle"].iloc[np.flatnonzero(track == worst)[0]]
         raise InputError(
             f"{tracks.file} has mixed units: vehicle {vehicle} moves {ratio[worst]:.3g} times as far as its speed "
             "says; give positions in m and speeds in m/s"
@@ -279,6 +264,7 @@ def _find_leaders(
     x_m: Floats,
     y_m: Floats,
     heading_rad: Floats,
+    driven_m: Floats,
     length_m: Floats,
     width_m: Floats,
     reach_m: float,
@@ -299,9 +285,13 @@ def _find_leaders(
                 if other == row or far or dx * along_x + dy * along_y <= 0.0 or turned < math.cos(_SAME_DIRECTION_RAD):
                     continue
                 beside_m = (width_m[row] + width_m[other]) / 2.0
-                found_m = _along_way(row, other, 1, track, x_m, y_m, heading_rad, beside_m, nearest_m, straight_m)
+                found_m = _along_way(
+                    row, other, 1, track, x_m, y_m, heading_rad, driven_m, beside_m, nearest_m, straight_m
+                )
                 if found_m < 0.0:
-                    found_m = _along_way(other, row, -1, track, x_m, y_m, heading_rad, beside_m, nearest_m, straight_m)
+                    found_m = _along_way(
+                        other, row, -1, track, x_m, y_m, heading_rad, driven_m, beside_m, nearest_m, straight_m
+                    )
                 touching_m = (length_m[row] + length_m[other]) / 2.0
                 if touching_m < found_m < nearest_m:
                     leader[row], nearest_m = other, found_m
@@ -317,6 +307,7 @@ def _along_way(
     x_m: Floats,
     y_m: Floats,
     heading_rad: Floats,
+    driven_m: Floats,
     most_beside_m: float,
     reach_m: float,
     straight_m: float,
@@ -330,9 +321,9 @@ def _along_way(
         other: row of the other one at this time.
         direction: 1 for the way from here on, -1 for the way to here.
     """
-    driven_m, nearest_m, found_m = 0.0, most_beside_m, -1.0
+    way_m, nearest_m, found_m = 0.0, most_beside_m, -1.0
     at = row
-    while driven_m <= reach_m:
+    while way_m <= reach_m:
         after = at + direction
         is_last = after < 0 or after >= len(track) or track[after] != track[row]
         if is_last:
@@ -347,25 +338,20 @@ def _along_way(
         along_m = min(max(dx * along_x + dy * along_y, 0.0), length_m)
         beside_m = math.hypot(dx - along_m * along_x, dy - along_m * along_y)
         if beside_m < nearest_m:
-            nearest_m, found_m = beside_m, driven_m + along_m
+            nearest_m, found_m = beside_m, way_m + along_m
         if is_last:
             break
-        driven_m += length_m
         at = after
+        way_m = abs(driven_m[at] - driven_m[row])
     return found_m
 
 
-def _stretches(
-    track: NDArray[np.int64], time_s: Floats, leader: NDArray[np.int64], jumping: NDArray[np.int64]
-) -> Iterator[tuple[int, int]]:
+def _stretches(track: NDArray[np.int64], leader: NDArray[np.int64], steps: Steps) -> Iterator[tuple[int, int]]:
     """Yield first and last row (exclusive) of each stretch of a track with one leader or none and without a break."""
-    jumps = np.isin(np.arange(len(track)), jumping)
-    cut = jumps | ((leader >= 0) & jumps[leader])
+    jumps, goes_on = np.zeros((2, len(track)), np.bool_)
+    jumps[steps.row], goes_on[steps.row] = steps.is_jump, ~(steps.is_jump | steps.is_long)
     leading = np.where(leader >= 0, track[leader], -1)
-    same_track = track[1:] == track[:-1]
-    steps_s = np.diff(time_s)
-    usual_s = float(np.median(steps_s[same_track])) if same_track.any() else math.inf
-    joined = same_track & (leading[1:] == leading[:-1]) & (steps_s <= _LONG_STEP * usual_s) & ~cut[1:]
+    joined = goes_on[1:] & (leading[1:] == leading[:-1]) & ~((leader >= 0) & jumps[leader])[1:]
     bounds = np.concatenate([[0], np.flatnonzero(~joined) + 1, [len(track)]])
     for first, last in pairwise(bounds):
         if last - first > 1:

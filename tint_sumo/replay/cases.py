@@ -10,11 +10,12 @@ import shapely
 from tint_sumo.config import SpeedMps, TimeS, VehicleShape
 from tint_sumo.core.errors import InputError, shown
 from tint_sumo.core.ranges import require_ranges
-from tint_sumo.replay.recordings import Placed, is_on_foot
+from tint_sumo.replay.recordings import Placed
 from tint_sumo.replay.routes import Routes, is_on_edge
 from tint_sumo.scenes.geometry import Boxes, Floats, clearance_m, new_boxes
 from tint_sumo.scenes.replay import NO_TRACK, Recording, ReplayCase, Way
 from tint_sumo.scenes.sumocfg import measure_route, require_on_route
+from tint_sumo.tracks.schema import is_on_foot
 
 _LEAST_WAY_M = 10.0  # of an ego
 _BEFORE_END_M = 1.0  # who drives just as recorded comes to the goal before the recording ends

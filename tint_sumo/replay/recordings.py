@@ -14,13 +14,12 @@ from tint_sumo.replay.routes import NO_LANE, Routes
 from tint_sumo.scenes.geometry import BOX, Boxes, Floats, Numbers
 from tint_sumo.scenes.replay import Recording
 from tint_sumo.tracks.matching import REASONS, Matched, match
-from tint_sumo.tracks.schema import KEYS, Tracks
+from tint_sumo.tracks.schema import KEYS, Tracks, is_on_foot
 
 _LONGEST_GAP_S = 1.0  # without a position; a vehicle is not there in a longer one
 _LEAST_S = 1.0  # of a recording
 _SAME = ("recording", "vehicle", "length_m", "width_m", "vehicle_class")  # in all rows of a track
 _EPS = 1e-6  # of a step
-_ON_FOOT = re.compile("pedestrian|bicycle|cyclist|person|animal|wheelchair")  # classes that never drive on
 _FAR = REASONS[0]  # why a row is on no lane, whatever its heading
 
 
@@ -36,10 +35,6 @@ class Placed:
 def label_of(vehicle_class: str) -> str:
     """Return the id of the vType of a class: SUMO allows few characters in ids."""
     return re.sub(r"[^\w.-]", "_", vehicle_class) or "_"
-
-
-def is_on_foot(label: str) -> bool:
-    return bool(_ON_FOOT.search(label.lower()))
 
 
 def vehicle_classes(tracks: Tracks) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from tint_sumo.core.errors import InputError
-from tint_sumo.core.files import require_output_folder, write_text
+from tint_sumo.core.files import require_output_folder, require_own_files, write_text
 from tint_sumo.scenes.drivers import DISTRIBUTION_ID, vtypes_xml
 from tint_sumo.scenes.layout import EGO
 from tint_sumo.scenes.network import REPLICA_SPACING_M, build_network, name, plain_xml, replica_origin
@@ -54,16 +54,11 @@ def write_scene(folder: Path, scene: Scene, replicas: int) -> list[Path]:
     """
     require_output_folder(folder)
     texts = scene_files(scene, replicas)
-    foreign = [file for file in texts if (folder / file).exists() and not _is_ours(folder / file)]
-    if foreign:
-        raise InputError(f"{folder} holds a {foreign[0]} that tint-sumo did not write; choose another `out`")
-    for file, text in texts.items():
-        write_text(folder / file, text)
-    return [folder / file for file in texts]
-
-
-def _is_ours(path: Path) -> bool:
-    return _WRITTEN_BY in path.read_text(encoding="utf-8", errors="replace")
+    files = [folder / file for file in texts]
+    require_own_files(files, _WRITTEN_BY)
+    for file, text in zip(files, texts.values(), strict=True):
+        write_text(file, text)
+    return files
 
 
 def _marked(text: str) -> str:

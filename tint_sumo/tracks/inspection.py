@@ -12,13 +12,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tint_sumo.core.files import whole_file
+from tint_sumo.tracks.motion import MOST_ACCELERATION_MPS2, SAME_UNITS, Steps, steps_of
 from tint_sumo.tracks.schema import Tracks
 
-MOST_ACCELERATION_MPS2 = 10.0  # cars brake with at most 9 to 10 m/s2 on dry roads
-_JUMP_M = 1.0  # noise of a position
-_LONG_STEP = 1.5  # times the usual step of a recording: frames are missing
 _TOUCH_M = 0.02  # boxes that overlap by less touch
-_SAME_UNITS = (0.8, 1.25)  # of the distance driven to the speed times the time, in recordings without mistakes
 _QUANTILES = (0.05, 0.5, 0.95)
 _FLAT_M = 1.0  # tracks with less sideways extent are drawn over the time
 
@@ -57,7 +54,7 @@ class Inspection:
     @property
     def has_mixed_units(self) -> bool:
         """Whether positions and speeds cannot have the units that the format says."""
-        low, high = _SAME_UNITS
+        low, high = SAME_UNITS
         return self.distance_ratio is not None and not low <= self.distance_ratio <= high
 
     def summary(self) -> dict[str, Any]:
@@ -66,48 +63,22 @@ class Inspection:
         return {"format": self.tracks.format, **values, "faults": asdict(self.faults)}
 
 
-@dataclass(frozen=True)
-class _Steps:
-    """Changes from each row to the next one of its track; all (S,)."""
-
-    row: NDArray[np.int64]  # the later of the two
-    time_s: NDArray[np.float64]
-    distance_m: NDArray[np.float64]
-    speed_mps: NDArray[np.float64]  # mean of both rows
-    top_speed_mps: NDArray[np.float64]  # the higher of both
-    acceleration_mps2: NDArray[np.float64]
-
-
-def _steps(tracks: Tracks) -> _Steps:
-    table, track = tracks.table, tracks.track_number
-    row = np.flatnonzero(track[1:] == track[:-1]) + 1
-    x_m, y_m, speed_mps, time_s = (table[name].to_numpy() for name in ("x_m", "y_m", "speed_mps", "time_s"))
-    step_s = time_s[row] - time_s[row - 1]
-    return _Steps(
-        row,
-        step_s,
-        np.hypot(x_m[row] - x_m[row - 1], y_m[row] - y_m[row - 1]),
-        (speed_mps[row] + speed_mps[row - 1]) / 2.0,
-        np.maximum(speed_mps[row], speed_mps[row - 1]),
-        (speed_mps[row] - speed_mps[row - 1]) / step_s,
-    )
-
-
 def inspect(tracks: Tracks) -> Inspection:
     """Count what is in some tracks."""
-    table, track, steps = tracks.table, tracks.track_number, _steps(tracks)
+    table, track, steps = tracks.table, tracks.track_number, steps_of(tracks)
     by_track = table.groupby(track)
     durations_s = (by_track["time_s"].max() - by_track["time_s"].min()).to_numpy()
     by_recording = table.groupby("recording", observed=True)["time_s"]
     classes = table["vehicle_class"].iloc[np.r_[0, np.flatnonzero(np.diff(track)) + 1]].value_counts()
-    driven_m, expected_m = steps.distance_m.sum(), (steps.speed_mps * steps.time_s).sum()
+    whole = ~steps.is_long  # where a vehicle was meanwhile is not known
+    driven_m, expected_m = steps.driven_m[whole].sum(), (steps.speed_mps * steps.time_s)[whole].sum()
     return Inspection(
         tracks=tracks,
         recordings=by_recording.ngroups,
         vehicles=len(durations_s),
         rows=len(table),
         duration_s=float((by_recording.max() - by_recording.min()).sum()),
-        step_s=float(np.median(steps.time_s)) if len(steps.row) else 0.0,
+        step_s=steps.usual_s,
         track_s=_quantiles(durations_s),
         speed_mps=_quantiles(table["speed_mps"].to_numpy()),
         classes={str(name): int(count) for name, count in classes.items() if count},
@@ -121,35 +92,20 @@ def _quantiles(values: NDArray[np.float64]) -> tuple[float, ...]:
     return tuple(float(value) for value in np.quantile(values, _QUANTILES))
 
 
-def _faults(tracks: Tracks, steps: _Steps) -> Faults:
+def _faults(tracks: Tracks, steps: Steps) -> Faults:
     track = tracks.track_number[steps.row]
-    usual_s = np.median(steps.time_s) if len(steps.row) else 0.0
     too_fast = np.abs(steps.acceleration_mps2) > MOST_ACCELERATION_MPS2
-    jumps = _jumps(steps)
-    long = steps.time_s > _LONG_STEP * usual_s
     pairs = overlapping(tracks.table)
     return Faults(
         int(too_fast.sum()),
         len(np.unique(track[too_fast])),
-        int(jumps.sum()),
-        len(np.unique(track[jumps])),
+        int(steps.is_jump.sum()),
+        len(np.unique(track[steps.is_jump])),
         len(pairs),
         len(pairs.drop_duplicates(["recording", "vehicle", "other"])),
-        int(long.sum()),
-        len(np.unique(track[long])),
+        int(steps.is_long.sum()),
+        len(np.unique(track[steps.is_long])),
     )
-
-
-def _jumps(steps: _Steps) -> NDArray[np.bool_]:
-    """Return in which steps a vehicle moves farther than its speeds and any acceleration allow; (S,)."""
-    reach_m = steps.top_speed_mps * steps.time_s + MOST_ACCELERATION_MPS2 * steps.time_s**2 / 2.0 + _JUMP_M
-    return np.asarray(steps.distance_m > reach_m)
-
-
-def jumping_rows(tracks: Tracks) -> NDArray[np.int64]:
-    """Return the rows at which a vehicle is farther from its row before than its speeds allow."""
-    steps = _steps(tracks)
-    return steps.row[_jumps(steps)]
 
 
 def overlapping(table: pd.DataFrame) -> pd.DataFrame:
@@ -229,7 +185,7 @@ def plot(found: Inspection, file: Path) -> None:
     ways, speed, acceleration = figure.subplot_mosaic(
         [["ways", "speed"], ["ways", "acceleration"]], width_ratios=[2, 1]
     ).values()
-    table, steps = found.tracks.table, _steps(found.tracks)
+    table, steps = found.tracks.table, steps_of(found.tracks)
     _, bottom, _, top = found.extent_m
     is_flat = top - bottom < _FLAT_M
     horizontal, vertical = ("time_s", "x_m") if is_flat else ("x_m", "y_m")

@@ -5,6 +5,7 @@ that headings grow counter-clockwise.
 """
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +44,7 @@ COLUMNS: tuple[str, ...] = tuple(TRACK_SCHEMA.names)
 KEYS = ["recording", "vehicle", "time_s"]
 _TEXTS = [field.name for field in TRACK_SCHEMA if pa.types.is_dictionary(field.type)]
 _NUMBERS = [name for name in COLUMNS if name not in _TEXTS]
+_ON_FOOT = re.compile("pedestrian|bicycle|cyclist|person|animal|wheelchair")
 UNKNOWN = "unknown"  # class of vehicles where a file names none
 _MOST = 1e12  # of any number: beyond all times since 1970 in seconds, and all positions on Earth in metres
 MOVED_M = 0.5  # a heading is derived from positions that lie so far apart, or it would follow the noise
@@ -111,6 +113,11 @@ def _first(table: pd.DataFrame, rows: NDArray[np.bool_]) -> str:
     """Return vehicle and time of the first of some rows, for messages."""
     row = table.iloc[int(np.flatnonzero(rows)[0])]
     return f"vehicle {row['vehicle']} at {row['time_s']:.10g} s"
+
+
+def is_on_foot(vehicle_class: str) -> bool:
+    """Return whether a class, as a file names it, is one that does not drive as cars do."""
+    return bool(_ON_FOOT.search(vehicle_class.lower()))
 
 
 def headings_of_motion(

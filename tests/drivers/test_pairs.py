@@ -101,6 +101,15 @@ def test_vehicles_that_come_back_have_no_other_units() -> None:
     assert found.inconsistent == 0
 
 
+def test_who_follows_a_vehicle_of_wrong_speed_follows_nobody_else() -> None:
+    time_s = 0.1 * np.arange(100)
+    row = {f"{at}": (12.0 * time_s - 25.0 * at, np.full(100, 24.0 if at == 5 else 12.0)) for at in range(12)}
+    found = on_a_street(row, time_s)
+    assert found.inconsistent == 1
+    sound = [(f"{at + 1}", f"{at}") for at in range(11) if at not in (4, 5)]
+    assert sorted((pair.follower, pair.leader) for pair in found.pairs) == sorted(sound)
+
+
 def test_who_drives_the_other_way_or_walks_is_no_leader() -> None:
     heading = np.concatenate([np.full(100, np.pi / 2), np.full(100, -np.pi / 2)])
     with pytest.raises(InputError, match="nobody follows"):

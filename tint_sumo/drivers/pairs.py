@@ -175,7 +175,7 @@ def find_pairs(
     time_s, x_m, y_m, heading_rad, speed_mps, length_m, width_m = (
         table[name].to_numpy() for name in ("time_s", "x_m", "y_m", "heading_rad", "speed_mps", "length_m", "width_m")
     )
-    drives = ~np.isin(track, wrong) & ~_on_foot(table)
+    drives, is_wrong = ~_on_foot(table), np.isin(track, wrong)
     rows, begins = _by_moment(table, drives)
     named = tracks.format == "leader_follower"
     reach_m, straight_m = (math.inf, math.inf) if named else (REACH_M, _STRAIGHT_M)
@@ -188,6 +188,8 @@ def find_pairs(
         own, other = slice(first, last), leader[first:last]
         free = other[0] < 0
         if free and (named or not with_free or not drives[first]):
+            continue
+        if is_wrong[first] or (not free and is_wrong[other[0]]):  # who follows such a vehicle follows nobody else
             continue
         pair = Pair(
             recording=names[0][first],

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import sumolib
 
-from tests.tracks.files import CAR, FILES, FRAMES, TRUCK, commonroad, csv, interaction, levelx, ngsim
+from tests.tracks.files import CAR, FILES, FRAMES, TRUCK, commonroad, csv, interaction, levelx, ngsim, tgsim
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import write_text
 from tint_sumo.dataset.recorder import record
@@ -132,6 +132,17 @@ def test_cases_of_interaction_are_recordings(tmp_path: Path) -> None:
     write_text(tmp_path / "cases.csv", "\n".join([f"case_id,{header}", *both]))
     found = inspect(read_tracks(tmp_path / "cases.csv"))
     assert (found.recordings, found.vehicles) == (2, 4)
+
+
+def test_files_that_number_their_parts_anew_are_other_recordings(tmp_path: Path) -> None:
+    header, *lines = interaction(tmp_path).read_text().splitlines()
+    runs = tgsim(tmp_path).read_text()
+    for place in ("merging", "roundabout"):
+        write_text(tmp_path / f"{place}.csv", "\n".join([f"case_id,{header}", *(f"1.0,{line}" for line in lines)]))
+        write_text(tmp_path / f"{place}_runs.csv", runs)
+        for name in (f"{place}", f"{place}_runs"):
+            recordings = read_tracks(tmp_path / f"{name}.csv").table["recording"].unique()
+            assert [recording.partition("/")[0] for recording in recordings] == [name]
 
 
 # Bad input

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tint_sumo.tracks.reading import Head, TrackFormat, read_columns_of, read_csv, recording_name, register
+from tint_sumo.tracks.reading import Head, TrackFormat, part_of, read_columns_of, read_csv, recording_name, register
 
 _NUMBERS = ["timestamp_ms", "x", "y", "vx", "vy", "psi_rad", "length", "width"]
 
@@ -18,7 +18,7 @@ def _read(file: Path) -> Mapping[str, Any]:
     has_cases = "case_id" in read_columns_of(file)
     rows = read_csv(file, _NUMBERS, ["track_id", "agent_type", *(["case_id"] if has_cases else [])])
     return {
-        "recording": rows["case_id"] if has_cases else recording_name(file),
+        "recording": part_of(file, rows["case_id"]) if has_cases else recording_name(file),
         "vehicle": rows["track_id"],
         "time_s": rows["timestamp_ms"] / 1000.0,
         "x_m": rows["x"],

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tint_sumo.tracks.reading import Head, TrackFormat, read_columns_of, read_csv, recording_name, register
+from tint_sumo.tracks.reading import Head, TrackFormat, part_of, read_columns_of, read_csv, recording_name, register
 from tint_sumo.tracks.schema import headings_of_motion
 
 _FOOT_M = 0.3048
@@ -51,7 +51,7 @@ def _read_ngsim(file: Path) -> Mapping[str, Any]:
 def _read_tgsim(file: Path) -> Mapping[str, Any]:
     has_runs = "run-index" in read_columns_of(file)
     rows = read_csv(file, _TGSIM_NUMBERS, ["id", "type-most-common", *(["run-index"] if has_runs else [])])
-    recording = rows["run-index"] if has_runs else pd.Series(recording_name(file), rows.index)
+    recording = part_of(file, rows["run-index"]) if has_runs else pd.Series(recording_name(file), rows.index)
     x_m, y_m = rows["xloc-kf"], -rows["yloc-kf"]
     return {
         "recording": recording,

@@ -121,6 +121,11 @@ def recording_name(file: Path) -> str:
     return Path(file.name.removesuffix(".gz")).stem
 
 
+def part_of(file: Path, part: pd.Series) -> pd.Series:
+    """Return names of a file's parts, such as cases or runs, which other files number anew."""
+    return f"{recording_name(file)}/" + part
+
+
 def _head(file: Path) -> Head:
     with opened(file) as content:
         head = content.read(_HEAD_BYTES)

@@ -271,7 +271,19 @@ def test_commas_stand_between_thousands_only(tmp_path: Path) -> None:
     write_text(file, re.sub(r"1118846(98\d)(\d00)", r'"1,118,846,\1,\2"', text))
     pd.testing.assert_frame_equal(read_tracks(file).table, table)
     write_text(file, text.replace(",1118846980200,", ',"1,5",', 1))
-    with pytest.raises(InputError, match=r"row \d+: .* is '1,5', not a number; correct it"):
+    with pytest.raises(InputError, match=r"row \d+: .* is '1,5', not a number; write decimals with points, not commas"):
+        read_tracks(file)
+
+
+@pytest.mark.parametrize("number", ["0,000", "13,500", "4,5"])
+def test_decimal_commas_are_no_thousands(tmp_path: Path, number: str) -> None:
+    file = ngsim(tmp_path)
+    text = file.read_text().replace(",", ";")
+    write_text(file, text.replace(";1118846980200;", f";{number};", 1))
+    with pytest.raises(InputError, match=rf"is '{number}', not a number; write decimals with points, not commas"):
+        read_tracks(file)
+    write_text(file, file.read_text().replace(";", ",").replace(f",{number},", ',"0,000",', 1))
+    with pytest.raises(InputError, match="is '0,000', not a number"):
         read_tracks(file)
 
 

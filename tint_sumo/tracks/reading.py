@@ -18,7 +18,7 @@ from tint_sumo.tracks.schema import Tracks, build_tracks
 _HEAD_BYTES = 4096  # of a file, from which its format is recognised
 _ROLE = "tracks"
 _SEPARATORS = (",", ";", "\t")
-_THOUSANDS = r"-?\d{1,3}(,\d{3})+(\.\d*)?"  # a comma before other digits may be a decimal one
+_THOUSANDS = r"-?[1-9]\d{0,2}(,\d{3})+(\.\d*)?"  # a comma before other digits may be a decimal one
 
 
 @dataclass(frozen=True)
@@ -176,19 +176,23 @@ def read_csv(file: Path, numbers: Sequence[str], texts: Sequence[str] = ()) -> p
         raise InputError(f"{file} lacks the column {', '.join(missing)}; give the file as it was published")
     table = pd.DataFrame({name: rows[names[name.lower()]].str.strip() for name in wanted})
     for name in numbers:
-        table[name] = _numbers(file, table[name])
+        table[name] = _numbers(file, table[name], separator)
     return table
 
 
-def _numbers(file: Path, texts: pd.Series) -> pd.Series:
-    """Return the numbers of a column, whose thousands may stand between commas."""
+def _numbers(file: Path, texts: pd.Series, separator: str) -> pd.Series:
+    """Return the numbers of a column, whose thousands may stand between commas where values do.
+
+    Where values stand between semicolons or tabs, commas are likelier decimal ones.
+    """
     values = pd.to_numeric(texts, errors="coerce")
     unread = values.isna()
-    if unread.any():
+    if unread.any() and separator == ",":
         grouped = texts[unread].where(texts[unread].str.fullmatch(_THOUSANDS), "")
         values[unread] = pd.to_numeric(grouped.str.replace(",", ""), errors="coerce")
     bad = np.flatnonzero(values.isna().to_numpy())
     if len(bad):
         found = texts.iloc[bad[0]]
-        raise InputError(f"{file}, row {bad[0] + 1}: {texts.name} is {found!r}, not a number; correct it")
+        mend = "write decimals with points, not commas" if "," in found else "correct it"
+        raise InputError(f"{file}, row {bad[0] + 1}: {texts.name} is {found!r}, not a number; {mend}")
     return values

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test
 
+from tests.envs.test_copies import Copy, copies
 from tests.scenes.networks import UserNetwork, netconvert, write_config
 from tint_sumo.config import EgoController
 from tint_sumo.core.errors import InputError
@@ -77,9 +78,15 @@ def busy(user_network: Callable[[str], UserNetwork]) -> Iterator[ParallelSceneEn
 
 def episode(env: ParallelSceneEnv, seed: int | None, choose: Callable[[str, int], int]) -> list[dict[str, Any]]:
     """Return what each step of an episode gives, the reset first."""
-    seen: list[dict[str, Any]] = [dict(zip(("observations", "infos"), env.reset(seed=seed), strict=True))]
+    begin = dict(zip(("observations", "infos"), env.reset(seed=seed), strict=True))
+    return [begin, *rest_of_episode(env, choose)]
+
+
+def rest_of_episode(env: ParallelSceneEnv, choose: Callable[[str, int], int]) -> list[dict[str, Any]]:
+    """Return what each step gives until the episode has ended."""
+    seen: list[dict[str, Any]] = []
     while env.agents:
-        returned = env.step({agent: choose(agent, len(seen)) for agent in env.agents})
+        returned = env.step({agent: choose(agent, len(seen) + 1) for agent in env.agents})
         seen.append(dict(zip(("observations", "rewards", "terminated", "truncated", "infos"), returned, strict=True)))
     return seen
 
@@ -189,6 +196,32 @@ def test_after_an_interrupt_it_begins_anew(env: ParallelSceneEnv, monkeypatch: p
     with pytest.raises(InputError, match="reset the environment first"):
         env.step({"west": GO, "south": GO})
     np.testing.assert_equal(episode(env, 2, at_random(0)), expected)
+
+
+@copies
+def test_a_copy_goes_on_like_the_original_which_does_not_notice(copied: Copy, busy: ParallelSceneEnv) -> None:
+    busy.reset(seed=3)
+    for _ in range(8):
+        busy.step(dict.fromkeys(busy.agents, GO))
+    with closing(copied(busy)) as twin:
+        planned = [rest_of_episode(twin, at_random(4)), episode(twin, None, at_random(5))]
+    went_on = [rest_of_episode(busy, at_random(4)), episode(busy, None, at_random(5))]
+    np.testing.assert_equal(planned, went_on)
+    assert len(went_on[0]) > 5
+
+
+@copies
+def test_a_copy_without_an_episode_is_as_the_original(copied: Copy, tasks: dict[str, TaskSettings]) -> None:
+    env = ParallelSceneEnv({"west": replace(tasks["west"], backend="traci")})
+    with closing(copied(env)) as new:
+        with pytest.raises(InputError, match="no episode has begun"):
+            new.step({"west": GO})
+        np.testing.assert_equal(new.reset(seed=2), env.reset(seed=2))
+    env.close()
+    closed = copied(env)
+    with pytest.raises(InputError, match="is closed"):
+        closed.reset()
+    closed.close()
 
 
 def test_a_closed_one_refuses_everything(tasks: dict[str, TaskSettings]) -> None:

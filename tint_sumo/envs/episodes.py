@@ -199,6 +199,11 @@ class TaskSettings:
         perceives = self.scene.perceives if isinstance(self.scene, SumocfgScene) else ()
         return observation_space(self.played.max_vehicles, perceives)
 
+    @property
+    def of_copy(self) -> "TaskSettings":
+        """These settings for a copy of an environment, whose original may use this process's libsumo."""
+        return replace(self, backend="auto") if self.backend == "libsumo" else self
+
     @cached_property
     def played(self) -> AnyScene:
         """The scene with these settings."""

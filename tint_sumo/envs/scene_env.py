@@ -333,8 +333,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._window = None
         if self.render_mode == "human":
             self.render_mode = None
-        if self._settings.backend == "libsumo":
-            self._settings = replace(self._settings, backend="auto")
+        self._settings = self._settings.of_copy
         if self._calls.phase is Phase.READY:
             drawn = self.np_random.bit_generator.state
             self.restore(self.snapshot())

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -267,10 +266,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         attributes, snapshots = state
         vars(self).update(attributes)
         self._calls = copy(self._calls)
-        self._settings = [
-            replace(settings, backend="auto") if settings.backend == "libsumo" else settings
-            for settings in self._settings
-        ]
+        self._settings = [settings.of_copy for settings in self._settings]
         if snapshots:
             self.restore(snapshots)
 

@@ -22,10 +22,11 @@ class SceneVecEnv(VecEnv):
 
     ``settings`` and ``workers`` are as in ``SceneVectorEnv``.
     ``infos[i]`` holds ``traits``, the true traits that go with the returned observation, and with towns ``town``, the
-    number of the town of the episode that made the step, and ``cost`` where red lights cost; when an episode ends also
-    ``terminal_observation``, ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``is_success``, ``time_s`` and,
-    after a collision, ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then; without
-    ``autoreset`` it has not, and the environment shows the end of its episode until it is parked or all are reset.
+    number of the town of the episode that made the step; after a step ``is_success``, and ``cost`` where red lights
+    cost; when an episode ends also ``terminal_observation``, ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``,
+    ``time_s`` and, after a collision, ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then;
+    without ``autoreset`` it has not, and the environment shows the end of its episode until it is parked or all are
+    reset.
     ``slots`` holds arrays (N, V) of what else is known of the vehicles in the returned observations, and
     ``terminal_slots`` the same of the terminal one: ``traits``, with ``tracks`` also ``position_m``, ``gap_m`` and
     ``passed``, and with a sensor that is not perfect what ``SceneEnv`` lists.
@@ -70,6 +71,8 @@ class SceneVecEnv(VecEnv):
         self._keep_slots(rows)
         listed = _listed(rows["traits"], rows["town"])
         contents = self.env.contents
+        for info in listed:
+            info["is_success"] = False
         for name in contents.step_infos:
             for info, value in zip(listed, rows[name].tolist(), strict=True):
                 info[name] = value

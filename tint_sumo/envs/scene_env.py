@@ -113,7 +113,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * `reward_terms`: the reward's named terms (after a step)
     * `time_s`: time since the episode's start
     * `town`: in a population with towns: number of the episode's town
-    * `is_success`: at the episode's end: whether the outcome is `"success"`
+    * `is_success`: after a step: whether the outcome is `"success"`
     * `cost`: after a step, with `red_light="cost"`: number of stop lines driven over at red in it
     * `collision`: after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`; for a person on foot
       in a SUMO configuration, `trait` is `"pedestrian"` and `slot` is -1

@@ -26,6 +26,7 @@ from tint_sumo.envs.episodes import TaskSettings, action_space, fingerprints, sh
 from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
 from tint_sumo.envs.rows import (
     GOING_ON,
+    SUCCESS,
     Observation,
     copied,
     end_info,
@@ -161,6 +162,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if not begun.all():  # an episode that begins has no rewards yet
             terms = _masked({term: rows[term] for term in self.contents.terms}, ~begun)
             more = {name: rows[name] for name in self.contents.step_infos}
+            more["is_success"] = rows["outcome"] == SUCCESS
             infos |= _masked({"reward_terms": terms, **more}, ~begun)
         for end in ended:
             infos = self._add_info(infos, self._ending(end), end.index)

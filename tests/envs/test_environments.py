@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
@@ -265,6 +266,17 @@ def test_the_stable_baselines3_adapter() -> None:
     assert_equal(venv.slots["traits"], [info["traits"] for info in infos])
     assert venv.get_attr("render_mode") == [None] * 4
     venv.close()
+
+
+def test_the_adapter_says_what_the_rewards_consist_of_at_ends_too() -> None:
+    with closing(SceneVecEnv(2, TaskSettings(time_limit_s=0.3), seed=0)) as venv:
+        venv.reset()
+        for _ in range(3):
+            _, rewards, dones, infos = venv.step(np.array([GO, STOP]))
+            for reward, info in zip(rewards, infos, strict=True):
+                assert info["reward_terms"].keys() == {"goal", "collision", "speed", "step"}
+                assert sum(info["reward_terms"].values()) == pytest.approx(reward, rel=1e-5)
+        assert dones.all()
 
 
 def test_parked_environments_are_empty_until_the_next_reset() -> None:

@@ -234,6 +234,19 @@ def find_sensor(sensor: str | Mapping[str, Any] | Sensor) -> Sensor:
     return find_named("sensor", sensor, SENSORS)
 
 
+def checked_settings(settings: Any) -> TaskSettings:
+    """Return settings of an environment; the default ones where they are None.
+
+    Raises:
+        InputError: they are none, such as the name of a scene.
+    """
+    if settings is None:
+        return TaskSettings()
+    if not isinstance(settings, TaskSettings):
+        raise InputError(f'settings must be TaskSettings, such as TaskSettings("on_ramp"), not {shown(settings)}')
+    return settings
+
+
 def action_space(scene: AnyScene) -> spaces.Discrete:
     return spaces.Discrete(len(scene.ego.controller.desired_speeds_mps))
 

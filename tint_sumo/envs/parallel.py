@@ -13,7 +13,7 @@ from pettingzoo import ParallelEnv
 
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_seed
-from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, episode_seed
+from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, checked_settings, episode_seed
 from tint_sumo.envs.rows import GOING_ON, Observation, fields_of, observation_of, start_info, step_info
 from tint_sumo.scenes import SumocfgScene
 from tint_sumo.scenes.replay import ReplayScene
@@ -235,7 +235,7 @@ def _scene_of(task: TaskSettings) -> SumocfgScene:
     Raises:
         InputError: it is none in which there can be others.
     """
-    scene = task.played
+    scene = checked_settings(task).played
     if not isinstance(scene, SumocfgScene) or isinstance(scene, ReplayScene):
         raise InputError("several egos need a SUMO configuration (from_sumocfg): built-in scenes have the way of one")
     if scene.ego_control != "speed":

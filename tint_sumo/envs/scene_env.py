@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Snapshot, checked_snapshots
 from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_case, checked_seed
-from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings, action_space
+from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings, action_space, checked_settings
 from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
 from tint_sumo.envs.rows import Observation, fields_of, observation_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
@@ -179,7 +179,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     def __init__(self, settings: TaskSettings | None = None, render_mode: str | None = None) -> None:
         require_render_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
-        settings = settings or TaskSettings()
+        settings = checked_settings(settings)
         fps = settings.render_fps
         modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}  # what is possible here

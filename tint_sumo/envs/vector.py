@@ -22,7 +22,7 @@ from tint_sumo.envs.calls import (
     checked_options,
     checked_seeds,
 )
-from tint_sumo.envs.episodes import TaskSettings, action_space, fingerprints, share_simulation
+from tint_sumo.envs.episodes import TaskSettings, action_space, checked_settings, fingerprints, share_simulation
 from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
 from tint_sumo.envs.rows import (
     GOING_ON,
@@ -79,12 +79,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ) -> None:
         num_envs = checked_count("num_envs", num_envs, MOST_ENVS)
-        if settings is None or isinstance(settings, TaskSettings):
-            count = 1 if workers is None else checked_count("workers", workers, num_envs)
-            settings = [settings or TaskSettings()] * count
-        elif workers not in (None, len(settings)):
-            raise InputError(f"{len(settings)} scenes need as many workers, not {workers}; leave workers out")
-        checked_count("the number of scenes", len(settings), num_envs)
+        settings = _shared_out(settings, num_envs, workers)
         require_render_mode(render_mode, self.metadata["render_modes"])
         first = settings[0]
         if len({task.played.max_vehicles for task in settings}) > 1:
@@ -271,6 +266,28 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         self._settings = [settings.of_copy for settings in self._settings]
         if snapshots:
             self.restore(snapshots)
+
+
+def _shared_out(settings: Any, num_envs: int, workers: int | None) -> list[TaskSettings]:
+    """Return the settings among which the environments are shared out: those given, or the same for each worker.
+
+    Raises:
+        InputError: they are no settings, more than environments, or do not fit the workers.
+    """
+    is_several = isinstance(settings, Sequence) and not isinstance(settings, str)
+    several = [checked_settings(task) for task in (settings if is_several else [settings])]
+    if not several:
+        raise InputError("there are no settings; give those of at least one scene")
+    if len(several) > num_envs:
+        raise InputError(f"num_envs must be at least {len(several)}, one for each scene or sensor, not {num_envs}")
+    if len(several) == 1:
+        return several * (1 if workers is None else checked_count("workers", workers, num_envs))
+    if workers not in (None, len(several)):
+        raise InputError(
+            f"workers are for environments of the same settings, and these are of {len(several)} (scenes or sensors); "
+            "leave workers out"
+        )
+    return several
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

@@ -34,7 +34,7 @@ class TraitObservation(VecEnvWrapper):
         key: ``"traits"``, or ``"true_traits"`` for those that only a critic may see.
 
     Raises:
-        InputError: the environment does not observe ego, vehicles and mask.
+        InputError: the environment does not observe ego, vehicles and mask, or has no tracks, which the source takes.
     """
 
     def __init__(self, venv: VecEnv, source: TraitSource, key: str = TRAITS) -> None:
@@ -43,6 +43,9 @@ class TraitObservation(VecEnvWrapper):
                 f"traits belong to observations with {', '.join(sorted(_NEEDED))}, as a scene's; "
                 f"this environment's space is {venv.observation_space}"
             )
+        *_, base = _layers(venv)
+        if source.needs_tracks and isinstance(base, SceneVecEnv) and "position_m" not in base.env.contents.slot_infos:
+            raise InputError("these traits need tracks; make the environment with TaskSettings(tracks=True)")
         slots = venv.observation_space["mask"].shape
         assert slots is not None
         space = trait_space(slots[0], source.size)

@@ -112,9 +112,12 @@ def test_a_seed_gives_the_same_episode_whatever_was_before(busy: ParallelSceneEn
     )
 
 
-def test_a_single_agent_lives_through_the_episodes_of_a_scene_env(user_network: Callable[[str], UserNetwork]) -> None:
+@pytest.mark.parametrize("sensor", ["perfect", "noisy_0.1"])
+def test_a_single_agent_lives_through_the_episodes_of_a_scene_env(
+    user_network: Callable[[str], UserNetwork], sensor: str
+) -> None:
     scene = user_network("merge").scene(perceives=("right_of_way", "lane"), time_limit_s=6.0)
-    task = TaskSettings(scene, tracks=True, decision_s=0.4)
+    task = TaskSettings(scene, tracks=True, decision_s=0.4, sensor=sensor)
     with closing(ParallelSceneEnv({"only": task})) as shared:
         episodes = [episode(shared, seed, at_random(2)) for seed in (5, None)]
     with closing(SceneEnv(task)) as single:

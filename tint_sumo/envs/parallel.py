@@ -244,5 +244,5 @@ def _scene_of(task: TaskSettings) -> SumocfgScene:
 
 
 def _sensor_seed(seed: int, number: int) -> int:
-    """Return the seed of an agent's sensor."""
-    return int(np.random.SeedSequence((seed, number)).generate_state(1)[0])
+    """Return the seed of an agent's sensor; that of the first is the episode's, as in ``SceneEnv``."""
+    return seed if number == 0 else int(np.random.SeedSequence((seed, number)).generate_state(1)[0])

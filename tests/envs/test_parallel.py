@@ -156,6 +156,13 @@ def test_an_agent_that_has_arrived_is_gone_and_the_other_goes_on(env: ParallelSc
     assert env.agents == ["south"] and infos["west"]["outcome"] == "success"
     with pytest.raises(InputError, match="actions must be those of south, not west, south"):
         env.step({"west": GO, "south": GO})
+    for actions, message in (
+        ([GO], r"a mapping with those of south, not \[2\]"),
+        (None, "not None"),
+        ({0: GO}, "south, not 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            env.step(actions)  # type: ignore[arg-type]
     while env.agents:
         observations, *_, infos = env.step({"south": GO})
         assert set(observations) == set(infos) == {"south"}

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
-from tint_sumo.core.errors import InputError
+from tint_sumo.core.errors import InputError, shown
 from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_seed
 from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, checked_settings, episode_seed
 from tint_sumo.envs.rows import GOING_ON, Observation, fields_of, observation_of, start_info, step_info
@@ -141,8 +141,11 @@ class ParallelSceneEnv(ParallelEnv):  # type: ignore[misc]  # PettingZoo has no 
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Take a decision of each agent whose episode goes on."""
         self._calls.require_episode()
+        wanted = ", ".join(self.agents) or "nobody"
+        if not isinstance(actions, Mapping):
+            raise InputError(f"actions must be a mapping with those of {wanted}, not {shown(actions)}")
         if set(actions) != set(self.agents):
-            raise InputError(f"actions must be those of {', '.join(self.agents) or 'nobody'}, not {', '.join(actions)}")
+            raise InputError(f"actions must be those of {wanted}, not {', '.join(map(str, actions))}")
         taken = {agent: self._checked(agent, actions[agent]) for agent in self.agents}
         with self._calls:
             self._decide(taken)

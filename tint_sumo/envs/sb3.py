@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from tint_sumo.envs.batch import Snapshot
-from tint_sumo.envs.calls import checked_seed
+from tint_sumo.envs.calls import checked_options, checked_seed
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import end_info, fields_of, observation_of, town_info
 from tint_sumo.envs.vector import SceneVectorEnv
@@ -52,6 +52,16 @@ class SceneVecEnv(VecEnv):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         return super().seed(checked_seed(seed))
+
+    def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
+        """Refuse options of the next reset, since there are none.
+
+        Raises:
+            InputError: one is given.
+        """
+        for of_one in options if isinstance(options, list) else [options]:
+            checked_options(of_one)
+        super().set_options(options)
 
     def reset(self) -> VecEnvObs:
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds

@@ -309,6 +309,9 @@ def test_rendering_shows_every_vehicle() -> None:
     _, info = env.reset(seed=0)
     image = env.render()
     assert image is not None and image.dtype == np.uint8 and image.shape == (320, 736, 3)
+    image[0] = 0  # users may draw on it, and the next picture is without that
+    again = env.render()
+    assert again is not None and again[0].any()
     for value, colour in enumerate(((40, 90, 200), (200, 40, 40))):
         pixels = np.isclose(image, colour, atol=3).all(axis=2).sum()
         vehicles = int((info["traits"] == value).sum())

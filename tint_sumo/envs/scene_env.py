@@ -32,11 +32,13 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     follows and a safety check can override.
 
     ## Action Space
-    `Discrete(3)`: desired speed 0, 0.5 or 3 m/s.
+    `Discrete(3)`: desired speed 0, 0.5 or 3 m/s; in `t_intersection_street` 0, 1 or 8.33 m/s (30 km/h). A SUMO
+    configuration has an action for each desired speed of its `controller`.
 
     ## Observation Space
     A `Dict` of float32 arrays, lengths divided by 20 m, speeds by 3 m/s, clipped to [-2, 2]; V is the scene's
-    `max_vehicles`, 12 in the T-intersection:
+    `max_vehicles`, 12 in the T-intersection. In `t_intersection_street`, lengths are divided by 100 m, speeds by
+    8.33 m/s, and V is 20; for a SUMO configuration see `scene` under Arguments:
 
     | Key        | Shape    | Content                                                                            |
     |------------|----------|------------------------------------------------------------------------------------|
@@ -135,9 +137,10 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * `p_conservative`: probability that a driver is conservative, in [0, 1]; default 0.4. Two numbers are a range, from
       which each episode draws its probability uniformly, by its seed.
     * `reward`: `"paper"` (default), `"authors"` (the values of the authors' code) or `"careful"`.
-    * `time_limit_s`: default 50 s.
+    * `time_limit_s`: default that of the scene: 50 s, but 60 s in `t_intersection_street`.
     * `max_episode_steps`: gymnasium's way to say it, in steps of the environment. `gymnasium.make` does not pass it on:
-      it wraps the environment in a `TimeLimit`, with which `outcome` stays empty; `gymnasium.make_vec` passes it on.
+      it wraps the environment in a `TimeLimit`, with which `outcome` stays empty; so does `gymnasium.make_vec` with a
+      `vectorization_mode`. Without one `gymnasium.make_vec` passes it on.
     * `sensor`: how the ego perceives the other vehicles: a `tint_sumo.config.Sensor`, a mapping as in
       configuration files, or the name of one in `tint_sumo.config.SENSORS`; default perfect. It may have noise,
       dropouts, a range, a field of view, occlusion and a delay.

@@ -121,13 +121,17 @@ def test_refused_masks(mask: Any, vector: SceneVectorEnv) -> None:
     assert [one.actions for one in vector.snapshot()] == [(), (2,)]
 
 
-def test_stable_baselines3s_environment_takes_numpys_seeds_and_refuses_bad_actions() -> None:
+def test_stable_baselines3s_environment_takes_numpys_seeds_and_refuses_bad_actions_and_options() -> None:
     with closing(SceneVectorEnv(2)) as vector:
         expected = vector.reset(seed=5)[0]
     with closing(SceneVecEnv(2, seed=np.int64(5))) as venv:  # type: ignore[arg-type]
         assert_equal(venv.reset(), expected)
         with pytest.raises(InputError, match="actions must be 2 of 0, 1, 2"):
             venv.step(np.array([True, True]))
+        for options in ({"case": 1}, [{}, {"case": 1}]):
+            with pytest.raises(InputError, match="there is no reset option 'case'; this environment knows none"):
+                venv.set_options(options)
+        venv.set_options()
         venv.step(np.array([2, 2]))
 
 

@@ -120,10 +120,25 @@ def test_monitor_reads_successes() -> None:
             while not ended:
                 *_, terminated, truncated, info = env.step(GO)
                 ended = terminated or truncated
-                assert ("is_success" in info) is ended
+                assert info["is_success"] is (info["outcome"] == "success")
             assert info["episode"]["is_success"] is (info["outcome"] == "success")
             outcomes.add(info["outcome"])
     assert outcomes == {"success", "collision"}
+
+
+@pytest.mark.parametrize("wrapped", [True, False])
+def test_an_episode_that_a_wrapper_ends_is_no_success(wrapped: bool) -> None:
+    """As the rates of Stable-Baselines3 count it, which leave out episodes that do not say so."""
+    limit = {"max_episode_steps": 2} if wrapped else {"time_limit_s": 0.2}
+    with closing(Monitor(gymnasium.make(ENV_ID, **limit), info_keywords=("is_success",))) as env:
+        env.reset(seed=0)
+        env.step(GO)
+        *_, truncated, info = env.step(GO)
+        assert truncated and info["outcome"] == ("" if wrapped else "timeout")
+        assert info["episode"]["is_success"] is False
+    with closing(SceneVecEnv(1, TaskSettings(time_limit_s=0.2))) as several:
+        several.reset()
+        assert [several.step(np.array([GO]))[3][0]["is_success"] for _ in range(2)] == [False, False]
 
 
 def test_evaluations_read_successes(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
@@ -267,6 +268,17 @@ def test_the_stable_baselines3_adapter() -> None:
     venv.close()
 
 
+def test_the_adapter_says_what_the_rewards_consist_of_at_ends_too() -> None:
+    with closing(SceneVecEnv(2, TaskSettings(time_limit_s=0.3), seed=0)) as venv:
+        venv.reset()
+        for _ in range(3):
+            _, rewards, dones, infos = venv.step(np.array([GO, STOP]))
+            for reward, info in zip(rewards, infos, strict=True):
+                assert info["reward_terms"].keys() == {"goal", "collision", "speed", "step"}
+                assert sum(info["reward_terms"].values()) == pytest.approx(reward, rel=1e-5)
+        assert dones.all()
+
+
 def test_parked_environments_are_empty_until_the_next_reset() -> None:
     venv, other = SceneVecEnv(3, seed=5), SceneVecEnv(3, seed=5)
     venv.reset(), other.reset()
@@ -297,6 +309,9 @@ def test_rendering_shows_every_vehicle() -> None:
     _, info = env.reset(seed=0)
     image = env.render()
     assert image is not None and image.dtype == np.uint8 and image.shape == (320, 736, 3)
+    image[0] = 0  # users may draw on it, and the next picture is without that
+    again = env.render()
+    assert again is not None and again[0].any()
     for value, colour in enumerate(((40, 90, 200), (200, 40, 40))):
         pixels = np.isclose(image, colour, atol=3).all(axis=2).sum()
         vehicles = int((info["traits"] == value).sum())

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test
 
+from tests.envs.test_copies import Copy, copies
 from tests.scenes.networks import UserNetwork, netconvert, write_config
 from tint_sumo.config import EgoController
 from tint_sumo.core.errors import InputError
@@ -77,9 +78,15 @@ def busy(user_network: Callable[[str], UserNetwork]) -> Iterator[ParallelSceneEn
 
 def episode(env: ParallelSceneEnv, seed: int | None, choose: Callable[[str, int], int]) -> list[dict[str, Any]]:
     """Return what each step of an episode gives, the reset first."""
-    seen: list[dict[str, Any]] = [dict(zip(("observations", "infos"), env.reset(seed=seed), strict=True))]
+    begin = dict(zip(("observations", "infos"), env.reset(seed=seed), strict=True))
+    return [begin, *rest_of_episode(env, choose)]
+
+
+def rest_of_episode(env: ParallelSceneEnv, choose: Callable[[str, int], int]) -> list[dict[str, Any]]:
+    """Return what each step gives until the episode has ended."""
+    seen: list[dict[str, Any]] = []
     while env.agents:
-        returned = env.step({agent: choose(agent, len(seen)) for agent in env.agents})
+        returned = env.step({agent: choose(agent, len(seen) + 1) for agent in env.agents})
         seen.append(dict(zip(("observations", "rewards", "terminated", "truncated", "infos"), returned, strict=True)))
     return seen
 
@@ -105,9 +112,12 @@ def test_a_seed_gives_the_same_episode_whatever_was_before(busy: ParallelSceneEn
     )
 
 
-def test_a_single_agent_lives_through_the_episodes_of_a_scene_env(user_network: Callable[[str], UserNetwork]) -> None:
+@pytest.mark.parametrize("sensor", ["perfect", "noisy_0.1"])
+def test_a_single_agent_lives_through_the_episodes_of_a_scene_env(
+    user_network: Callable[[str], UserNetwork], sensor: str
+) -> None:
     scene = user_network("merge").scene(perceives=("right_of_way", "lane"), time_limit_s=6.0)
-    task = TaskSettings(scene, tracks=True, decision_s=0.4)
+    task = TaskSettings(scene, tracks=True, decision_s=0.4, sensor=sensor)
     with closing(ParallelSceneEnv({"only": task})) as shared:
         episodes = [episode(shared, seed, at_random(2)) for seed in (5, None)]
     with closing(SceneEnv(task)) as single:
@@ -146,6 +156,13 @@ def test_an_agent_that_has_arrived_is_gone_and_the_other_goes_on(env: ParallelSc
     assert env.agents == ["south"] and infos["west"]["outcome"] == "success"
     with pytest.raises(InputError, match="actions must be those of south, not west, south"):
         env.step({"west": GO, "south": GO})
+    for actions, message in (
+        ([GO], r"a mapping with those of south, not \[2\]"),
+        (None, "not None"),
+        ({0: GO}, "south, not 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            env.step(actions)  # type: ignore[arg-type]
     while env.agents:
         observations, *_, infos = env.step({"south": GO})
         assert set(observations) == set(infos) == {"south"}
@@ -189,6 +206,32 @@ def test_after_an_interrupt_it_begins_anew(env: ParallelSceneEnv, monkeypatch: p
     with pytest.raises(InputError, match="reset the environment first"):
         env.step({"west": GO, "south": GO})
     np.testing.assert_equal(episode(env, 2, at_random(0)), expected)
+
+
+@copies
+def test_a_copy_goes_on_like_the_original_which_does_not_notice(copied: Copy, busy: ParallelSceneEnv) -> None:
+    busy.reset(seed=3)
+    for _ in range(8):
+        busy.step(dict.fromkeys(busy.agents, GO))
+    with closing(copied(busy)) as twin:
+        planned = [rest_of_episode(twin, at_random(4)), episode(twin, None, at_random(5))]
+    went_on = [rest_of_episode(busy, at_random(4)), episode(busy, None, at_random(5))]
+    np.testing.assert_equal(planned, went_on)
+    assert len(went_on[0]) > 5
+
+
+@copies
+def test_a_copy_without_an_episode_is_as_the_original(copied: Copy, tasks: dict[str, TaskSettings]) -> None:
+    env = ParallelSceneEnv({"west": replace(tasks["west"], backend="traci")})
+    with closing(copied(env)) as new:
+        with pytest.raises(InputError, match="no episode has begun"):
+            new.step({"west": GO})
+        np.testing.assert_equal(new.reset(seed=2), env.reset(seed=2))
+    env.close()
+    closed = copied(env)
+    with pytest.raises(InputError, match="is closed"):
+        closed.reset()
+    closed.close()
 
 
 def test_a_closed_one_refuses_everything(tasks: dict[str, TaskSettings]) -> None:

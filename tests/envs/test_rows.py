@@ -251,7 +251,13 @@ def test_infos_of_a_row() -> None:
     begun["traits"][:] = 5
     assert rows["traits"][0].tolist() == [1, -1], "an info keeps its values"
     terms = {"goal": 2.5, "collision": 0.0, "speed": 0.0, "step": 0.0}
-    assert set(step_info(going_on, Contents(), {})) == {"traits", "outcome", "time_s", "reward_terms"}
+    assert set(step_info(going_on, Contents(), {})) == {
+        "traits",
+        "outcome",
+        "time_s",
+        "reward_terms",
+        "is_success",
+    }
     info = step_info(over, Contents(slot_infos=()), {"trait": "aggressive"})
     assert info.pop("reward_terms") == terms
     assert info == {"outcome": "success", "time_s": 0.3, "is_success": True, "collision": {"trait": "aggressive"}}

@@ -1,6 +1,8 @@
 """Properties of the environments of all scenes."""
 
+from collections.abc import Callable
 from contextlib import closing
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -9,6 +11,8 @@ import pytest
 from tint_sumo import ENV_IDS, SCENE_ENV_ID
 from tint_sumo.core.errors import InputError
 from tint_sumo.envs import SceneEnv, SceneVectorEnv, TaskSettings
+from tint_sumo.envs.parallel import ParallelSceneEnv
+from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.scenes import SCENES, find_scene
 
 GO = np.int64(2)
@@ -102,10 +106,32 @@ def test_environments_of_several_scenes_are_those_of_each_scene() -> None:
 
 def test_several_scenes_need_as_many_workers() -> None:
     two = [TaskSettings("four_way"), TaskSettings("roundabout")]
-    with pytest.raises(InputError, match="2 scenes need as many workers, not 3; leave workers out"):
+    with pytest.raises(InputError, match=r"these are of 2 \(scenes or sensors\); leave workers out"):
         SceneVectorEnv(6, two, workers=3)
-    with pytest.raises(InputError, match="the number of scenes must lie in 1 to 1, not 2"):
+    with pytest.raises(InputError, match="num_envs must be at least 2, one for each scene or sensor, not 1"):
         SceneVectorEnv(1, two)
+    with pytest.raises(InputError, match="give those of at least one scene"):
+        SceneVectorEnv(1, [])
+
+
+def test_settings_in_a_list_of_one_are_as_those_alone() -> None:
+    with closing(SceneVectorEnv(2, [TaskSettings()], workers=2)) as env:
+        assert len(env._settings) == 2
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        SceneEnv,
+        lambda name: SceneVectorEnv(2, name),
+        lambda name: SceneVectorEnv(2, [name, name]),
+        lambda name: SceneVecEnv(2, name),
+        lambda name: ParallelSceneEnv({"ego": name}),
+    ],
+)
+def test_the_name_of_a_scene_is_no_settings(make: Callable[[Any], Any]) -> None:
+    with pytest.raises(InputError, match=r'settings must be TaskSettings, such as .*\("on_ramp"\), not \'on_ramp\''):
+        make("on_ramp")
 
 
 def test_gymnasium_takes_a_list_of_scenes() -> None:

@@ -55,6 +55,8 @@ def test_what_is_held_out_is_not_in_the_training() -> None:
 def test_a_test_has_one_sensor_and_a_world_one_name() -> None:
     with pytest.raises(InputError, match="are for training, and a test has one sensor; give another world"):
         task_in(find_world("strangers"), TaskSettings())
+    with pytest.raises(InputError, match="num_envs must be at least 9, one for each scene or sensor, not 4"):
+        gymnasium.make_vec(STRANGERS_ENV_ID, num_envs=4, world="strangers")
     with pytest.raises(InputError, match=r"unknown world 'moon'; choose one of: old, strangers"):
         find_world("moon")
 

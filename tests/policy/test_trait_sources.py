@@ -1,14 +1,17 @@
 import math
+from contextlib import closing
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecMonitor
 
 from tint_sumo.config import RelativeLatent, RelativeSettings
 from tint_sumo.core.errors import InputError
 from tint_sumo.dataset.windows import cut_windows
+from tint_sumo.envs.sb3 import SceneVecEnv
 from tint_sumo.policy.trait_sources import (
     ClassifierTraits,
     EncoderTraits,
@@ -267,6 +270,13 @@ def test_model_of_another_latent_size_is_refused() -> None:
 def test_other_environments_are_refused() -> None:
     with pytest.raises(InputError, match="ego, mask, vehicles"):
         TraitObservation(Memory(2), NoTraits())
+    with (
+        closing(VecMonitor(SceneVecEnv(1))) as env,
+        pytest.raises(
+            InputError, match=r"these traits need tracks; make the environment with TaskSettings\(tracks=True\)"
+        ),
+    ):
+        TraitObservation(env, EncoderTraits(load("vae")))
 
 
 def test_streaming_is_the_posterior_of_the_track_so_far() -> None:

@@ -21,10 +21,14 @@ def test_a_decision_is_so_many_steps_and_the_sum_of_their_rewards() -> None:
     repeated.reset()
     for action in (GO, STOP, GO):
         actions = np.full(3, action)
-        rewards = sum(plain.step(actions)[1] for _ in range(3))
-        expected, reward, done, _ = plain.step(actions)
-        observation, total, ended, _ = repeated.step(actions)
-        np.testing.assert_allclose(total, rewards + reward, rtol=1e-5)
+        steps = [plain.step(actions) for _ in range(4)]
+        expected, _, done, _ = steps[-1]
+        observation, total, ended, infos = repeated.step(actions)
+        np.testing.assert_allclose(total, sum(step[1] for step in steps), rtol=1e-5)
+        for index, info in enumerate(infos):
+            assert sum(info["reward_terms"].values()) == pytest.approx(total[index], rel=1e-5)
+            for term, value in info["reward_terms"].items():
+                assert value == pytest.approx(sum(step[3][index]["reward_terms"][term] for step in steps))
         assert not (done | ended).any()
         for key, value in expected.items():
             np.testing.assert_array_equal(observation[key], value)

@@ -118,6 +118,10 @@ def test_bad_input_is_one_clear_line(street: Path, vehicles: list[Driven], ego: 
         ({"tracks": None}, "tracks must be a file of tracks, or Tracks, not None"),
         ({"reactive": "yes"}, "reactive must be True or False, not 'yes'"),
         ({"yields": ["west"]}, "yields must be a mapping"),
+        *(
+            ({"shift_m": shift_m}, "shift_m must be two numbers, added to x and y in m, not")
+            for shift_m in (3, "a", (1, 2, 3), None, ("a", "b"), (0.0, float("nan")), (1.0, (2.0, 3.0)))
+        ),
         ({"step_s": 0.0}, "step_s must lie in 0.01 to 1, not 0.0"),
         ({"step_s": 0.0333}, "step_s must be whole milliseconds"),
         ({"release_m": -1.0}, "release_m must lie in"),

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,6 +37,19 @@ def test_no_two_scenes_have_one_name() -> None:
         register(SCENES[T_INTERSECTION])
     with pytest.raises(InputError, match="unknown scene 'moon'; choose one of: "):
         find_scene("moon")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (None, r"scene must be a name \(.*four_way.*\) or a scene, not None"),
+        (3, "or a scene, not 3"),
+        (["on_ramp", "four_way"], "give one scene; a list of scenes is for gymnasium.make_vec without a vectorizatio"),
+    ],
+)
+def test_what_is_no_scene_is_refused(given: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        find_scene(given)
 
 
 @scenes

@@ -199,6 +199,11 @@ class TaskSettings:
         perceives = self.scene.perceives if isinstance(self.scene, SumocfgScene) else ()
         return observation_space(self.played.max_vehicles, perceives)
 
+    @property
+    def of_copy(self) -> "TaskSettings":
+        """These settings for a copy of an environment, whose original may use this process's libsumo."""
+        return replace(self, backend="auto") if self.backend == "libsumo" else self
+
     @cached_property
     def played(self) -> AnyScene:
         """The scene with these settings."""
@@ -227,6 +232,19 @@ def find_sensor(sensor: str | Mapping[str, Any] | Sensor) -> Sensor:
     if not isinstance(sensor, str):
         raise InputError(f"sensor must be a Sensor or a name ({', '.join(SENSORS)}), not {shown(sensor)}")
     return find_named("sensor", sensor, SENSORS)
+
+
+def checked_settings(settings: Any) -> TaskSettings:
+    """Return settings of an environment; the default ones where they are None.
+
+    Raises:
+        InputError: they are none, such as the name of a scene.
+    """
+    if settings is None:
+        return TaskSettings()
+    if not isinstance(settings, TaskSettings):
+        raise InputError(f'settings must be TaskSettings, such as TaskSettings("on_ramp"), not {shown(settings)}')
+    return settings
 
 
 def action_space(scene: AnyScene) -> spaces.Discrete:

@@ -1,7 +1,9 @@
 """Several egos in one SUMO configuration, as PettingZoo's parallel environments have agents."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -9,14 +11,15 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
-from tint_sumo.core.errors import InputError
+from tint_sumo.core.errors import InputError, shown
 from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_seed
-from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, episode_seed
+from tint_sumo.envs.episodes import Episodes, TaskSettings, action_space, checked_settings, episode_seed
 from tint_sumo.envs.rows import GOING_ON, Observation, fields_of, observation_of, start_info, step_info
 from tint_sumo.scenes import SumocfgScene
 from tint_sumo.scenes.replay import ReplayScene
 from tint_sumo.simulation import SharedTraffic
 
+Decision = dict[str, np.ndarray]  # action (1,) of each agent that goes on, by its name
 _SHARED = ("config", "warm_up_s", "warm_up_spread_s", "warm_starts")  # fields in which the scenes of all agents agree
 
 
@@ -38,6 +41,9 @@ class ParallelSceneEnv(ParallelEnv):  # type: ignore[misc]  # PettingZoo has no 
 
     ## Seeds
     ``reset(seed=...)`` determines traffic and sensors to the last bit. Without a seed the next episode follows.
+
+    ## Copies
+    As those of ``SceneEnv``: ``copy.deepcopy`` and pickles make independent environments in the same state.
 
     Args:
         tasks: settings of each agent, by its name, with the same ``decision_s`` and ``backend``.
@@ -65,16 +71,35 @@ class ParallelSceneEnv(ParallelEnv):  # type: ignore[misc]  # PettingZoo has no 
             for agent, task in tasks.items()
         }
         self._np_random = seeding.np_random()[0]
+        self._began: dict[str, Any] = {}  # state of the generator before the present episode
+        self._decisions: list[Decision] = []  # of the present episode
         self._calls = Calls()
-        self._start_simulation()
+        self._traffic = self._make_traffic()
 
-    def _start_simulation(self) -> None:
+    def _make_traffic(self) -> SharedTraffic:
         first = next(iter(self._tasks.values()))
-        self._traffic = SharedTraffic([_scene_of(task) for task in self._tasks.values()], first.backend)
-        self._episodes = {
+        return SharedTraffic([_scene_of(task) for task in self._tasks.values()], first.backend)
+
+    @cached_property
+    def _traffic(self) -> SharedTraffic:
+        """The running simulation; started when it is needed in a copy, or after a call that was interrupted."""
+        self._calls.require_open()
+        return self._make_traffic()
+
+    @cached_property
+    def _episodes(self) -> dict[str, Episodes]:
+        """The agents' episodes in the running simulation."""
+        return {
             agent: Episodes(1, [task], simulation=view)
             for (agent, task), view in zip(self._tasks.items(), self._traffic.views, strict=True)
         }
+
+    def _stop(self) -> None:
+        """End the simulation, if one runs."""
+        self.__dict__.pop("_episodes", None)
+        if "_traffic" in self.__dict__:
+            self._traffic.close()
+            del self._traffic
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         return self.observation_spaces[agent]
@@ -92,26 +117,35 @@ class ParallelSceneEnv(ParallelEnv):  # type: ignore[misc]  # PettingZoo has no 
         seed = checked_seed(seed)
         if seed is not None:
             self._np_random = seeding.np_random(seed)[0]
-        if self._calls.phase is Phase.BUSY:  # an interrupted call may have been done in part
-            self._traffic.close()
-            self._start_simulation()
-        with self._calls:
-            drawn = episode_seed(self._np_random)
-            self._traffic.begin(drawn)
-            for number, episodes in enumerate(self._episodes.values()):
-                episodes.begin(0, _sensor_seed(drawn, number))
+        self._play(())
         self.agents = list(self.possible_agents)
         fields = {agent: fields_of(self._episodes[agent].rows) for agent in self.agents}
         infos = {agent: start_info(fields[agent], self._tasks[agent].contents) for agent in self.agents}
         return {agent: self._observation(agent, fields[agent]) for agent in self.agents}, infos
+
+    def _play(self, decisions: Sequence[Decision]) -> None:
+        """Begin the generator's next episode, and take these decisions in it."""
+        if self._calls.phase is Phase.BUSY:  # an interrupted call may have been done in part
+            self._stop()
+        with self._calls:
+            self._began, self._decisions = dict(self._np_random.bit_generator.state), []
+            drawn = episode_seed(self._np_random)
+            self._traffic.begin(drawn)
+            for number, episodes in enumerate(self._episodes.values()):
+                episodes.begin(0, _sensor_seed(drawn, number))
+            for taken in decisions:
+                self._decide(taken)
 
     def step(
         self, actions: Mapping[str, int]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Take a decision of each agent whose episode goes on."""
         self._calls.require_episode()
+        wanted = ", ".join(self.agents) or "nobody"
+        if not isinstance(actions, Mapping):
+            raise InputError(f"actions must be a mapping with those of {wanted}, not {shown(actions)}")
         if set(actions) != set(self.agents):
-            raise InputError(f"actions must be those of {', '.join(self.agents) or 'nobody'}, not {', '.join(actions)}")
+            raise InputError(f"actions must be those of {wanted}, not {', '.join(map(str, actions))}")
         taken = {agent: self._checked(agent, actions[agent]) for agent in self.agents}
         with self._calls:
             self._decide(taken)
@@ -134,8 +168,9 @@ class ParallelSceneEnv(ParallelEnv):  # type: ignore[misc]  # PettingZoo has no 
         assert isinstance(space, spaces.Discrete)
         return checked_actions(action, (), int(space.n)).reshape(1)
 
-    def _decide(self, taken: Mapping[str, np.ndarray]) -> None:
+    def _decide(self, taken: Decision) -> None:
         """Take the steps of a decision; the ego of an episode that ends leaves the roads."""
+        self._decisions.append(taken)
         going_on = list(taken)
         for step in range(self._steps_per_decision):
             if not going_on:
@@ -167,7 +202,20 @@ class ParallelSceneEnv(ParallelEnv):  # type: ignore[misc]  # PettingZoo has no 
     def close(self) -> None:
         """End the simulation; safe to call twice. Everything else is refused from then on."""
         self._calls.phase = Phase.CLOSED
-        self._traffic.close()
+        self._stop()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle consists of: everything but the simulation."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_traffic", "_episodes")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy from its state, as in ``SceneEnv``."""
+        self.__dict__.update(state)
+        self._calls = copy(self._calls)
+        self._tasks = {agent: task.of_copy for agent, task in self._tasks.items()}
+        if self._calls.phase is Phase.READY:
+            self._np_random.bit_generator.state = self._began
+            self._play(self._decisions)
 
 
 def _require_fitting(tasks: Mapping[str, TaskSettings]) -> None:
@@ -190,7 +238,7 @@ def _scene_of(task: TaskSettings) -> SumocfgScene:
     Raises:
         InputError: it is none in which there can be others.
     """
-    scene = task.played
+    scene = checked_settings(task).played
     if not isinstance(scene, SumocfgScene) or isinstance(scene, ReplayScene):
         raise InputError("several egos need a SUMO configuration (from_sumocfg): built-in scenes have the way of one")
     if scene.ego_control != "speed":
@@ -199,5 +247,5 @@ def _scene_of(task: TaskSettings) -> SumocfgScene:
 
 
 def _sensor_seed(seed: int, number: int) -> int:
-    """Return the seed of an agent's sensor."""
-    return int(np.random.SeedSequence((seed, number)).generate_state(1)[0])
+    """Return the seed of an agent's sensor; that of the first is the episode's, as in ``SceneEnv``."""
+    return seed if number == 0 else int(np.random.SeedSequence((seed, number)).generate_state(1)[0])

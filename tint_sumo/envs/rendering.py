@@ -154,4 +154,4 @@ class Canvas:
         return self.pixels(centre + corners @ np.stack([ahead, abreast]))
 
     def image(self) -> NDArray[np.uint8]:
-        return np.asarray(self.drawing.reduce(self._oversampling))
+        return np.array(self.drawing.reduce(self._oversampling))  # a copy, which users may draw on

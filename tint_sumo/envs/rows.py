@@ -28,7 +28,7 @@ OUTCOMES: tuple[str, ...] = get_args(Outcome)
 BUILT_IN_OUTCOMES = OUTCOMES[:3]  # SUMO takes no ego off the roads of built-in scenes
 _PAPER_WAY_M = 17.2  # from the ego's start to its goal in the paper's scene
 # Numbers of outcomes in rows: positions in OUTCOMES, plus 1.
-GOING_ON, _SUCCESS, _TIMEOUT, COLLISION, _LOST, RED_LIGHT = range(6)
+GOING_ON, SUCCESS, _TIMEOUT, COLLISION, _LOST, RED_LIGHT = range(6)
 BOUND = OBSERVATION_BOUND
 
 Rows = NDArray[np.void]  # records (N,) of a row type
@@ -129,11 +129,14 @@ def step_info(fields: Mapping[str, Any], contents: Contents, collision: dict[str
     info = start_info(fields, contents)
     info["reward_terms"] = {term: fields[term] for term in contents.terms}
     info |= {name: fields[name] for name in contents.step_infos}
-    return info | end_info(info["outcome"], collision) if info["outcome"] else info
+    return info | end_info(info["outcome"], collision)
 
 
 def end_info(outcome: str, collision: dict[str, Any]) -> dict[str, Any]:
-    """Return what a step's info holds only where an episode has ended; ``collision`` is empty without one."""
+    """Return what a step's info says of the end of the episode; ``collision`` is empty without one.
+
+    ``is_success`` is False while the episode goes on: a wrapper may end it then, and its success is still read.
+    """
     ending = {"is_success": outcome == "success"}
     return {**ending, "collision": collision} if collision else ending
 
@@ -141,8 +144,8 @@ def end_info(outcome: str, collision: dict[str, Any]) -> dict[str, Any]:
 def full_info(info: Mapping[str, Any], contents: Contents) -> dict[str, Any]:
     """Return an info with the same keys in every step of an episode, as arrays of all steps need them.
 
-    After a reset rewards and costs are 0, before the end ``is_success`` is False, and without a collision its texts are
-    empty, its slot is -1 and its position nan.
+    After a reset rewards and costs are 0 and ``is_success`` is False, and without a collision its texts are empty, its
+    slot is -1 and its position nan.
     """
     start = {"reward_terms": dict.fromkeys(contents.terms, 0.0), **dict.fromkeys(contents.step_infos, 0.0)}
     no_collision = {"trait": "", "route": "", "slot": NO_VEHICLE, "ego_m": (math.nan, math.nan)}
@@ -205,14 +208,14 @@ def judge(
         elif ran_red[index]:
             row.outcome = RED_LIGHT
         elif front_m[index] > rules.goal_m:
-            row.outcome = _SUCCESS
+            row.outcome = SUCCESS
         elif lost[index]:
             row.outcome = _LOST
         else:
             row.outcome = _TIMEOUT if steps[index] >= rules.step_limit else GOING_ON
-        row.terminated = row.outcome in (_SUCCESS, COLLISION, RED_LIGHT)
+        row.terminated = row.outcome in (SUCCESS, COLLISION, RED_LIGHT)
         row.truncated = row.outcome in (_TIMEOUT, _LOST)
-        row.goal = rules.goal if row.outcome == _SUCCESS else 0.0
+        row.goal = rules.goal if row.outcome == SUCCESS else 0.0
         row.collision = rules.collision if row.outcome == COLLISION else 0.0
         row.speed = 0.0 if row.terminated else rules.speed_weight_per_mps * speed_mps[index]
         row.step = 0.0 if row.terminated else rules.step

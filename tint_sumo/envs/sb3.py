@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from tint_sumo.envs.batch import Snapshot
-from tint_sumo.envs.calls import checked_seed
+from tint_sumo.envs.calls import checked_options, checked_seed
 from tint_sumo.envs.episodes import TaskSettings
 from tint_sumo.envs.rows import end_info, fields_of, observation_of, town_info
 from tint_sumo.envs.vector import SceneVectorEnv
@@ -22,10 +22,11 @@ class SceneVecEnv(VecEnv):
 
     ``settings`` and ``workers`` are as in ``SceneVectorEnv``.
     ``infos[i]`` holds ``traits``, the true traits that go with the returned observation, and with towns ``town``, the
-    number of the town of the episode that made the step, and ``cost`` where red lights cost; when an episode ends also
-    ``terminal_observation``, ``TimeLimit.truncated``, ``terminal_slots``, ``outcome``, ``is_success``, ``time_s`` and,
-    after a collision, ``collision``. As Stable-Baselines3 wants it, the next episode has begun by then; without
-    ``autoreset`` it has not, and the environment shows the end of its episode until it is parked or all are reset.
+    number of the town of the episode that made the step; after a step ``reward_terms``, ``is_success``, and ``cost``
+    where red lights cost; when an episode ends also ``terminal_observation``, ``TimeLimit.truncated``,
+    ``terminal_slots``, ``outcome``, ``time_s`` and, after a collision, ``collision``. As Stable-Baselines3 wants it,
+    the next episode has begun by then; without ``autoreset`` it has not, and the environment shows the end of its
+    episode until it is parked or all are reset.
     ``slots`` holds arrays (N, V) of what else is known of the vehicles in the returned observations, and
     ``terminal_slots`` the same of the terminal one: ``traits``, with ``tracks`` also ``position_m``, ``gap_m`` and
     ``passed``, and with a sensor that is not perfect what ``SceneEnv`` lists.
@@ -52,6 +53,16 @@ class SceneVecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         return super().seed(checked_seed(seed))
 
+    def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
+        """Refuse options of the next reset, since there are none.
+
+        Raises:
+            InputError: one is given.
+        """
+        for of_one in options if isinstance(options, list) else [options]:
+            checked_options(of_one)
+        super().set_options(options)
+
     def reset(self) -> VecEnvObs:
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         observation, infos = self.env.reset(seed=seeds)
@@ -70,6 +81,8 @@ class SceneVecEnv(VecEnv):
         self._keep_slots(rows)
         listed = _listed(rows["traits"], rows["town"])
         contents = self.env.contents
+        for info, terms in zip(listed, _each(rows, contents.terms), strict=True):
+            info["is_success"], info["reward_terms"] = False, terms
         for name in contents.step_infos:
             for info, value in zip(listed, rows[name].tolist(), strict=True):
                 info[name] = value
@@ -82,6 +95,7 @@ class SceneVecEnv(VecEnv):
                 "outcome": end.outcome,
                 "time_s": last["time_s"],
                 **town_info(last["town"]),
+                "reward_terms": {term: last[term] for term in contents.terms},
                 **{name: last[name] for name in contents.step_infos},
                 **end_info(end.outcome, end.collision),
             }
@@ -138,3 +152,9 @@ class SceneVecEnv(VecEnv):
 def _listed(traits: NDArray[np.int16], towns: NDArray[np.int64]) -> list[dict[str, Any]]:
     """Return an info for each environment: the true traits (N, V), and the town (N,) of those that have one."""
     return [{"traits": one, "outcome": "", **town_info(town)} for one, town in zip(traits, towns.tolist(), strict=True)]
+
+
+def _each(rows: dict[str, NDArray[Any]], fields: Sequence[str]) -> list[dict[str, Any]]:
+    """Return some fields (N,) of rows for each of them."""
+    values = zip(*(rows[field].tolist() for field in fields), strict=True)
+    return [dict(zip(fields, of_one, strict=True)) for of_one in values]

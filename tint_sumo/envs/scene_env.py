@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tint_sumo.envs.batch import Snapshot, checked_snapshots
 from tint_sumo.envs.calls import Calls, Phase, checked_actions, checked_case, checked_seed
-from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings, action_space
+from tint_sumo.envs.episodes import Episodes, EpisodeStart, TaskSettings, action_space, checked_settings
 from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
 from tint_sumo.envs.rows import Observation, fields_of, observation_of, start_info, step_info
 from tint_sumo.envs.window import Window, has_display
@@ -32,11 +32,13 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     follows and a safety check can override.
 
     ## Action Space
-    `Discrete(3)`: desired speed 0, 0.5 or 3 m/s.
+    `Discrete(3)`: desired speed 0, 0.5 or 3 m/s; in `t_intersection_street` 0, 1 or 8.33 m/s (30 km/h). A SUMO
+    configuration has an action for each desired speed of its `controller`.
 
     ## Observation Space
     A `Dict` of float32 arrays, lengths divided by 20 m, speeds by 3 m/s, clipped to [-2, 2]; V is the scene's
-    `max_vehicles`, 12 in the T-intersection:
+    `max_vehicles`, 12 in the T-intersection. In `t_intersection_street`, lengths are divided by 100 m, speeds by
+    8.33 m/s, and V is 20; for a SUMO configuration see `scene` under Arguments:
 
     | Key        | Shape    | Content                                                                            |
     |------------|----------|------------------------------------------------------------------------------------|
@@ -113,7 +115,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * `reward_terms`: the reward's named terms (after a step)
     * `time_s`: time since the episode's start
     * `town`: in a population with towns: number of the episode's town
-    * `is_success`: at the episode's end: whether the outcome is `"success"`
+    * `is_success`: after a step: whether the outcome is `"success"`
     * `cost`: after a step, with `red_light="cost"`: number of stop lines driven over at red in it
     * `collision`: after a collision: the other driver's `trait`, `route`, `slot`, and `ego_m`; for a person on foot
       in a SUMO configuration, `trait` is `"pedestrian"` and `slot` is -1
@@ -135,9 +137,10 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     * `p_conservative`: probability that a driver is conservative, in [0, 1]; default 0.4. Two numbers are a range, from
       which each episode draws its probability uniformly, by its seed.
     * `reward`: `"paper"` (default), `"authors"` (the values of the authors' code) or `"careful"`.
-    * `time_limit_s`: default 50 s.
+    * `time_limit_s`: default that of the scene: 50 s, but 60 s in `t_intersection_street`.
     * `max_episode_steps`: gymnasium's way to say it, in steps of the environment. `gymnasium.make` does not pass it on:
-      it wraps the environment in a `TimeLimit`, with which `outcome` stays empty; `gymnasium.make_vec` passes it on.
+      it wraps the environment in a `TimeLimit`, with which `outcome` stays empty; so does `gymnasium.make_vec` with a
+      `vectorization_mode`. Without one `gymnasium.make_vec` passes it on.
     * `sensor`: how the ego perceives the other vehicles: a `tint_sumo.config.Sensor`, a mapping as in
       configuration files, or the name of one in `tint_sumo.config.SENSORS`; default perfect. It may have noise,
       dropouts, a range, a field of view, occlusion and a delay.
@@ -179,7 +182,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
     def __init__(self, settings: TaskSettings | None = None, render_mode: str | None = None) -> None:
         require_render_mode(render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
-        settings = settings or TaskSettings()
+        settings = checked_settings(settings)
         fps = settings.render_fps
         modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
         self.metadata = {**self.metadata, "render_modes": modes, "render_fps": fps}  # what is possible here
@@ -333,8 +336,7 @@ class SceneEnv(gymnasium.Env[Any, Any]):
         self._window = None
         if self.render_mode == "human":
             self.render_mode = None
-        if self._settings.backend == "libsumo":
-            self._settings = replace(self._settings, backend="auto")
+        self._settings = self._settings.of_copy
         if self._calls.phase is Phase.READY:
             drawn = self.np_random.bit_generator.state
             self.restore(self.snapshot())

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -23,10 +22,11 @@ from tint_sumo.envs.calls import (
     checked_options,
     checked_seeds,
 )
-from tint_sumo.envs.episodes import TaskSettings, action_space, fingerprints, share_simulation
+from tint_sumo.envs.episodes import TaskSettings, action_space, checked_settings, fingerprints, share_simulation
 from tint_sumo.envs.rendering import RENDER_FPS, require_render_mode
 from tint_sumo.envs.rows import (
     GOING_ON,
+    SUCCESS,
     Observation,
     copied,
     end_info,
@@ -79,12 +79,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ) -> None:
         num_envs = checked_count("num_envs", num_envs, MOST_ENVS)
-        if settings is None or isinstance(settings, TaskSettings):
-            count = 1 if workers is None else checked_count("workers", workers, num_envs)
-            settings = [settings or TaskSettings()] * count
-        elif workers not in (None, len(settings)):
-            raise InputError(f"{len(settings)} scenes need as many workers, not {workers}; leave workers out")
-        checked_count("the number of scenes", len(settings), num_envs)
+        settings = _shared_out(settings, num_envs, workers)
         require_render_mode(render_mode, self.metadata["render_modes"])
         first = settings[0]
         if len({task.played.max_vehicles for task in settings}) > 1:
@@ -162,6 +157,7 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         if not begun.all():  # an episode that begins has no rewards yet
             terms = _masked({term: rows[term] for term in self.contents.terms}, ~begun)
             more = {name: rows[name] for name in self.contents.step_infos}
+            more["is_success"] = rows["outcome"] == SUCCESS
             infos |= _masked({"reward_terms": terms, **more}, ~begun)
         for end in ended:
             infos = self._add_info(infos, self._ending(end), end.index)
@@ -267,12 +263,31 @@ class SceneVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         attributes, snapshots = state
         vars(self).update(attributes)
         self._calls = copy(self._calls)
-        self._settings = [
-            replace(settings, backend="auto") if settings.backend == "libsumo" else settings
-            for settings in self._settings
-        ]
+        self._settings = [settings.of_copy for settings in self._settings]
         if snapshots:
             self.restore(snapshots)
+
+
+def _shared_out(settings: Any, num_envs: int, workers: int | None) -> list[TaskSettings]:
+    """Return the settings among which the environments are shared out: those given, or the same for each worker.
+
+    Raises:
+        InputError: they are no settings, more than environments, or do not fit the workers.
+    """
+    is_several = isinstance(settings, Sequence) and not isinstance(settings, str)
+    several = [checked_settings(task) for task in (settings if is_several else [settings])]
+    if not several:
+        raise InputError("there are no settings; give those of at least one scene")
+    if len(several) > num_envs:
+        raise InputError(f"num_envs must be at least {len(several)}, one for each scene or sensor, not {num_envs}")
+    if len(several) == 1:
+        return several * (1 if workers is None else checked_count("workers", workers, num_envs))
+    if workers not in (None, len(several)):
+        raise InputError(
+            f"workers are for environments of the same settings, and these are of {len(several)} (scenes or sensors); "
+            "leave workers out"
+        )
+    return several
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

@@ -34,7 +34,7 @@ class TraitObservation(VecEnvWrapper):
         key: ``"traits"``, or ``"true_traits"`` for those that only a critic may see.
 
     Raises:
-        InputError: the environment does not observe ego, vehicles and mask.
+        InputError: the environment does not observe ego, vehicles and mask, or has no tracks, which the source takes.
     """
 
     def __init__(self, venv: VecEnv, source: TraitSource, key: str = TRAITS) -> None:
@@ -43,6 +43,9 @@ class TraitObservation(VecEnvWrapper):
                 f"traits belong to observations with {', '.join(sorted(_NEEDED))}, as a scene's; "
                 f"this environment's space is {venv.observation_space}"
             )
+        *_, base = _layers(venv)
+        if source.needs_tracks and isinstance(base, SceneVecEnv) and "position_m" not in base.env.contents.slot_infos:
+            raise InputError("these traits need tracks; make the environment with TaskSettings(tracks=True)")
         slots = venv.observation_space["mask"].shape
         assert slots is not None
         space = trait_space(slots[0], source.size)
@@ -100,7 +103,7 @@ def _dictionary(observation: Any) -> Observation:
 
 
 class ActionRepeat(VecEnvWrapper):
-    """Wrapper that takes each action for ``repeat`` steps and returns the sum of their rewards, and of their costs.
+    """Wrapper that takes each action for ``repeat`` steps and returns the sum of their rewards, terms and costs.
 
     An episode that ends within a decision ends the decision; the next episode then waits, with desired speed 0, for
     the rest of it. The controller and its safety check go on working at every step.
@@ -145,14 +148,21 @@ class ActionRepeat(VecEnvWrapper):
             observation, rewards, done, infos = self.venv.step(np.where(ended, _STOP, self._actions))
             total += np.where(ended, 0.0, rewards)
             for index in np.flatnonzero(~ended):
-                if COST in infos[index]:
-                    infos[index][COST] += last[index].get(COST, 0.0)
+                _add_up(infos[index], last[index])
                 last[index] = infos[index]
             ended |= done
             if self._on_step is not None:
                 terminal = {env: infos[env]["terminal_observation"] for env in np.flatnonzero(done).tolist()}
                 self._on_step(_continued(_dictionary(observation), terminal), infos)
         return observation, total, ended, last
+
+
+def _add_up(info: dict[str, Any], before: dict[str, Any]) -> None:
+    """Add to the info of a step what the decision's earlier steps, if any, have cost and been rewarded."""
+    if COST in info:
+        info[COST] += before.get(COST, 0.0)
+    for term, value in before.get("reward_terms", {}).items():
+        info["reward_terms"][term] += value
 
 
 def source_of(venv: VecEnv) -> TraitSource | None:

@@ -52,6 +52,7 @@ def from_tracks(
             the ego has no way.
     """
     _require_arguments(net, tracks, reactive, yields, step_s)
+    _require_shift(shift_m)
     network = read_net(Path(net))
     recorded = tracks if isinstance(tracks, Tracks) else read_tracks(Path(tracks), track_format)
     routes, labels, who = Routes(network), vehicle_classes(recorded), find_drivers(drivers)
@@ -105,6 +106,16 @@ def _require_arguments(net: Any, tracks: Any, reactive: Any, yields: Any, step_s
             raise InputError(f"{name} must be {wanted}, not {shown(value)}")
     get_args(StepS)[1].require("step_s", step_s)
     require_whole_milliseconds(step_s)
+
+
+def _require_shift(shift_m: Any) -> None:
+    """Raise InputError unless a shift consists of two finite numbers."""
+    try:
+        are_two = np.shape(shift_m) == (2,) and bool(np.isfinite(shift_m).all())
+    except (TypeError, ValueError):  # no numbers
+        are_two = False
+    if not are_two:
+        raise InputError(f"shift_m must be two numbers, added to x and y in m, not {shown(shift_m)}")
 
 
 def _digest(recordings: Sequence[Recording], cases: Sequence[ReplayCase]) -> str:

@@ -7,7 +7,7 @@ from functools import cache
 from typing import overload
 
 from tint_sumo.config import STEP_S
-from tint_sumo.core.errors import InputError, find_named
+from tint_sumo.core.errors import InputError, find_named, shown
 from tint_sumo.scenes.scene import Scene
 from tint_sumo.scenes.sumocfg import SumocfgScene
 
@@ -42,9 +42,18 @@ def find_scene(scene: str | AnyScene) -> AnyScene:
     """Return the scene of a name; a scene itself is returned as it is. Commands and users' calls do so once.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or it is no scene.
     """
-    return find_named("scene", scene, SCENES)() if isinstance(scene, str) else scene
+    if isinstance(scene, str):
+        return find_named("scene", scene, SCENES)()
+    if isinstance(scene, list | tuple):
+        raise InputError(
+            "give one scene; a list of scenes is for gymnasium.make_vec without a vectorization_mode, "
+            "of tint_sumo/Scene-v0"
+        )
+    if not isinstance(scene, AnyScene):
+        raise InputError(f"scene must be a name ({', '.join(SCENES)}) or a scene, not {shown(scene)}")
+    return scene
 
 
 def find_scenes(scene: str | AnyScene) -> tuple[AnyScene, ...]:

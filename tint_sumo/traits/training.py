@@ -94,7 +94,7 @@ def train(
     }
     with claim_folder(out, identity):
         if (out / f"{RUN_MODEL}.json").exists():
-            return load(out / f"{RUN_MODEL}.safetensors")  # the folder alone could be the name of a shipped model
+            return load(out)
         with preserved_random_state():
             torch.manual_seed(_stream_seed(seed, 0))
             model = model_type(settings, latent_size)

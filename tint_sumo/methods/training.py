@@ -218,7 +218,11 @@ def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | N
     if learned.encoder is None:
         return None
     encoder = trait_models.load(_trait_model(learned, traits), latent_size=LATENT_SIZE)
-    learned.make_source(encoder, PpoSettings())  # refuses a model of another method where it needs one of its own
+    if encoder.method != learned.encoder:
+        raise InputError(
+            f"method {learned.name} needs a trait model of the method {learned.encoder}, not of {encoder.method}; "
+            "give such a model as `traits`"
+        )
     return encoder
 
 

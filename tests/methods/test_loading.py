@@ -19,7 +19,7 @@ from tint_sumo.core.weights import write_weights
 from tint_sumo.envs import TaskSettings
 from tint_sumo.methods import loading
 from tint_sumo.methods.evaluation import evaluate
-from tint_sumo.methods.loading import find_policy, load_policy, shipped_policies
+from tint_sumo.methods.loading import find_policy, load_policy, shipped_policies, shipped_policy
 from tint_sumo.methods.registry import METHODS, Learned, built_in_methods
 from tint_sumo.methods.rules import AlwaysGo, TimeToCollision
 from tint_sumo.methods.training import train_policy
@@ -142,6 +142,32 @@ def test_shipped_policies_by_name(shelf: Path) -> None:
     contender = load_policy("vae")
     assert (contender.name, contender.p_conservative) == ("vae", Mix(0.6))
     assert find_policy("vae") == shelf / "vae"
+
+
+def test_files_of_the_user_come_before_shipped_policies_of_their_name(
+    shelf: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("vae").mkdir()
+    assert find_policy("vae") == shelf / "vae", "a folder without a policy"
+    shutil.copytree(run, "no_labels")
+    for name in ("no_labels", "./no_labels"):
+        assert find_policy(name) == Path("no_labels/policy")
+        assert load_policy(name).p_conservative == ALL_MIXES
+    assert shipped_policy("no_labels") == shelf / "no_labels"
+
+
+def test_a_shipped_policy_drives_with_the_shipped_trait_model_whatever_the_present_folder_holds(
+    encoders: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for suffix in (".safetensors", ".json"):
+        shutil.copyfile(encoders / f"vae{suffix}", f"vae{suffix}")
+    source = load_policy(shipped_policy("vae")).source
+    assert source is not None
+    used = source()
+    assert isinstance(used, EncoderTraits) and isinstance(used.model, traits.TraitModel)
+    assert used.model.settings == traits.storage.read_card(traits.storage.shipped_model("vae")).settings
 
 
 def test_unknown_names_are_answered_with_the_known_ones(shelf: Path, tmp_path: Path) -> None:

@@ -645,9 +645,17 @@ def test_a_trait_model_of_another_latent_size_is_refused(tmp_path: Path, tiny: P
     assert not (tmp_path / "run").exists()
 
 
-def test_a_trait_model_that_cannot_stream_is_refused(tmp_path: Path, tiny: PpoSettings, trait_model: Path) -> None:
-    with pytest.raises(InputError, match="streaming needs the posteriors of a cross_window model, not of vae"):
-        train_policy("streaming", Mix(0.4), 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
+@pytest.mark.parametrize(
+    ("method", "needed"), [("streaming", "cross_window"), ("ma", "classifier"), ("morton", "morton")]
+)
+def test_a_trait_model_of_another_method_is_refused(
+    method: str, needed: str, tmp_path: Path, tiny: PpoSettings, trait_model: Path
+) -> None:
+    message = f"method {method} needs a trait model of the method {needed}, not of vae; give such a model as `traits`"
+    with pytest.raises(InputError, match=message):
+        train_policy(method, Mix(0.4), 64, 0, tmp_path / "run", settings=tiny, traits=trait_model)
+    with pytest.raises(InputError, match=message):
+        share_training(tmp_path / "oracle", method, tmp_path / "run", trait_model)
     assert not (tmp_path / "run").exists()
 
 

@@ -323,6 +323,11 @@ def test_streaming_needs_posteriors(method: str) -> None:
         StreamingTraits(load(method))
 
 
+def test_classes_need_a_classifier() -> None:
+    with pytest.raises(InputError, match="not of vae; give a trait model of the method classifier"):
+        ClassifierTraits(load("vae"))
+
+
 def test_a_classifiers_predictions_look_like_true_traits() -> None:
     """Slot 3 drives at 2 m/s, slot 5 at 3 m/s, as an aggressive driver does; nobody is ahead of them."""
     traits, _ = play([[drive(60)]], ClassifierTraits(load("classifier")), 25)

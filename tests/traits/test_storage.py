@@ -1,5 +1,6 @@
 import json
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -7,7 +8,7 @@ import torch
 from tint_sumo.core.errors import InputError
 from tint_sumo.traits import load, storage
 from tint_sumo.traits.input_range import InputRange
-from tint_sumo.traits.storage import add_to_card, read_card, save
+from tint_sumo.traits.storage import add_to_card, find, read_card, save, shipped_model
 from tint_sumo.traits.vae import Vae
 
 
@@ -54,6 +55,16 @@ def test_a_saved_model_encodes_as_before(saved, model, street, path):
 
 def test_shipped_models_are_found_by_name(shelf, model, street):
     assert_same_encoding(load("vae"), model, street)
+
+
+def test_files_of_the_user_come_before_shipped_models_of_their_name(shelf, small, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "older").mkdir()
+    save(Vae(small), tmp_path / "vae" / "model", {"seed": 5})
+    assert find("older") == shelf / "older", "a folder without a model"
+    assert find("vae") == find("./vae") == Path("vae/model")
+    assert read_card("vae").seed == 5
+    assert find(shipped_model("vae")) == shelf / "vae"
 
 
 def test_an_unknown_name_is_answered_with_the_shipped_trait_models(shelf):

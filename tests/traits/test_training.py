@@ -30,6 +30,20 @@ def assert_same_weights(one, other):
         assert torch.equal(value, other.state_dict()[name]), name
 
 
+def test_other_labels_or_drivers_are_another_run_where_a_method_learns_from_them(street, small, tmp_path):
+    windows, conservative = street
+    short = replace(small, epochs=1)
+    train(windows, short, tmp_path / "labels", method="classifier", conservative=conservative)
+    with pytest.raises(InputError, match=r"already holds another run.*windows_sha256"):
+        train(windows, short, tmp_path / "labels", method="classifier", conservative=~conservative)
+    renamed = replace(windows, driver=windows.driver // 2)
+    train(windows, short, tmp_path / "drivers", method="cross_window")
+    with pytest.raises(InputError, match=r"already holds another run.*windows_sha256"):
+        train(renamed, short, tmp_path / "drivers", method="cross_window")
+    same = train(windows, short, tmp_path / "vae")
+    assert_same_weights(train(renamed, short, tmp_path / "vae"), same)
+
+
 def test_a_run_writes_a_model_that_loads_as_trained(windows, small, tmp_path):
     model = train(windows, small, tmp_path / "run", card={"data": {"scene": "street"}})
     assert_same_weights(load(tmp_path / "run"), model)

@@ -23,6 +23,7 @@ from tint_sumo.methods.registry import find_learned
 from tint_sumo.methods.training import new_model, training_venv
 from tint_sumo.policy import ActionRepeat, GruPolicy, StreamingTraits, TraitObservation
 from tint_sumo.scenes import paper_scene
+from tint_sumo.traits.storage import shipped_model
 
 DECISION_METHOD = (
     "a decision: with one intersection and one thread, trait inference at every simulation step of a decision and one "
@@ -111,7 +112,7 @@ def _contrib_model(venv: VecEnv, seed: int, settings: PpoSettings) -> OnPolicyAl
 def decision_ms(settings: PpoSettings, decisions: int) -> float:
     """Return the median time of a decision (``DECISION_METHOD``) with streaming traits and the study's network."""
     env = SceneVecEnv(1, TaskSettings(tracks=True), seed=0)
-    observed = TraitObservation(env, StreamingTraits(traits.load("cross_window")))
+    observed = TraitObservation(env, StreamingTraits(traits.load(shipped_model("cross_window"))))
     with closing(ActionRepeat(observed, settings.action_repeat)) as venv, single_threaded():
         policy = GruPolicy(venv.observation_space, venv.action_space, lambda _: 0.0, settings=settings.policy)
         clocks = Clocks()

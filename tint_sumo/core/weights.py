@@ -29,6 +29,21 @@ def card_file(stem: Path) -> Path:
     return stem.with_name(stem.name + ".json")
 
 
+def find_weights(given: Path, in_run: str, shipped_folder: Path) -> Path | None:
+    """Return the path of a model without its suffix; None if there is none.
+
+    The files of the user come before the shipped ones, so that a folder may be called like a shipped model.
+
+    Args:
+        given: folder of a training run, file of weights, or name of a shipped model.
+        in_run: name of the model in the folder of a run.
+        shipped_folder: the folder of the shipped models.
+    """
+    weights = given.with_suffix("") if given.suffix == ".safetensors" else given
+    stems = (given / in_run, weights, shipped_folder / given)
+    return next((stem for stem in stems if stem.name and weights_file(stem).is_file()), None)
+
+
 def write_weights(stem: Path, weights: Mapping[str, Tensor]) -> dict[str, str]:
     """Write the weights of a model; return the card's entries about the file."""
     content = safetensors.torch.save(dict(weights))

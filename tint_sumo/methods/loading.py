@@ -16,7 +16,7 @@ from tint_sumo.core.determinism import preserved_random_state
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
 from tint_sumo.core.structures import build
-from tint_sumo.core.weights import card_file, weights_file
+from tint_sumo.core.weights import card_file, find_weights, weights_file
 from tint_sumo.envs import TaskSettings
 from tint_sumo.envs.perceived import perceived_in
 from tint_sumo.methods.registry import METHODS, Learned, Policy, Rule, find_learned
@@ -27,6 +27,7 @@ from tint_sumo.policy.storage import load_policy_network, read_policy_card, requ
 from tint_sumo.policy.wrappers import OnStep, policy_venv
 from tint_sumo.scenes import ALL_SCENES, SCENES, AnyScene, SumocfgScene, find_scene, paper_scene, read_described
 from tint_sumo.traits import TraitModel
+from tint_sumo.traits.storage import shipped_model
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def load_policy(
 
     Args:
         name_or_path: name, folder of a training run, .safetensors file, or Stable-Baselines3's .zip file with the
-            card beside it.
+            card beside it. The name of a rule comes first, then files that are there, then shipped policies.
         scene: the scene it shall drive in; if not given the one it was trained in, for rules the paper's.
         allow_pickle: read .zip files. They can run any code, so allow that only for files you trust.
 
@@ -173,10 +174,10 @@ def _load_encoder(stem: Path, card: dict[str, Any]) -> TraitModel:
     return encoder
 
 
-def trait_model_of(stem: Path, card: Mapping[str, Any]) -> str | Path:
-    """Return name or path of the trait model that the card of a policy names."""
+def trait_model_of(stem: Path, card: Mapping[str, Any]) -> Path:
+    """Return the path of the trait model that the card of a policy names: the one beside it, or a shipped one."""
     named: str = card["traits"]
-    return weights_file(stem.with_name(TRAITS)) if named == TRAITS else named
+    return weights_file(stem.with_name(TRAITS)) if named == TRAITS else shipped_model(named)
 
 
 def find_policy(name_or_path: str | Path) -> Path:
@@ -185,16 +186,12 @@ def find_policy(name_or_path: str | Path) -> Path:
     Raises:
         InputError: there is no such policy.
     """
-    given = Path(name_or_path)
-    named = shipped("models") / "policies" / given
-    weights = given.with_suffix("") if given.suffix == ".safetensors" else given
-    for stem in (named, given / POLICY, weights):
-        if stem.name and weights_file(stem).is_file():
-            return stem
-    if (given / "run.json").exists():
-        raise InputError(f"{given} holds a run that is not finished; repeat its command to finish it")
-    rules = [name for name, method in METHODS.items() if isinstance(method, Rule)]
     folder = shipped("models") / "policies"
+    if (stem := find_weights(Path(name_or_path), POLICY, folder)) is not None:
+        return stem
+    if (Path(name_or_path) / "run.json").exists():
+        raise InputError(f"{name_or_path} holds a run that is not finished; repeat its command to finish it")
+    rules = [name for name, method in METHODS.items() if isinstance(method, Rule)]
     others = sorted(file.relative_to(folder).with_suffix("").as_posix() for file in folder.glob("*/*.safetensors"))
     raise InputError(
         f"no policy {name_or_path}; give {', '.join([*rules, *shipped_policies(), *others])}, the folder of a training "
@@ -202,9 +199,14 @@ def find_policy(name_or_path: str | Path) -> Path:
     )
 
 
+def shipped_policy(name: str) -> Path:
+    """Return the path of a shipped policy without its suffix: that policy, whatever the present folder holds."""
+    return shipped("models") / "policies" / name
+
+
 def shipped_policies() -> list[str]:
     """Return the names of the shipped policies of the paper's setting, in the order of the methods."""
-    return [name for name in METHODS if weights_file(shipped("models") / "policies" / name).is_file()]
+    return [name for name in METHODS if weights_file(shipped_policy(name)).is_file()]
 
 
 def _checked_card(stem: Path) -> dict[str, Any]:

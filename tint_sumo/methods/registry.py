@@ -236,7 +236,7 @@ def window_traits(model: "Encoder") -> "TraitSource":
     return EncoderTraits(model)
 
 
-def classified_traits(model: "Encoder") -> "TraitSource":
+def classified_traits(model: "TraitModel") -> "TraitSource":
     from tint_sumo.policy.trait_sources import ClassifierTraits
 
     return ClassifierTraits(model)

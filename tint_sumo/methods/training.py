@@ -42,7 +42,7 @@ from tint_sumo.policy.wrappers import policy_venv
 from tint_sumo.scenes import T_INTERSECTION, AnyScene, described, find_scenes, require_trait_steps
 from tint_sumo.scenes.drivers import require_two_kinds
 from tint_sumo.traits import TraitModel
-from tint_sumo.traits.storage import read_card, require_scene, save
+from tint_sumo.traits.storage import read_card, require_scene, save, shipped_model
 
 FilmMaker = Callable[[Path], bytes | None]  # a GIF of the policy in a file; None where there can be none
 
@@ -123,7 +123,7 @@ def train_policy(
         require_trait_steps(one)
     trained_in = described(scenes)
     if encoder is not None and not other_scene:
-        require_scene(traits or str(learned.encoder), trained_in["scene"], trained_in["scene_digest"], "the policy")
+        require_scene(_trait_model(learned, traits), trained_in["scene"], trained_in["scene_digest"], "the policy")
     settings = learned.settings_of(settings)
     places = len(scenes) * len(sensors)
     if places > settings.n_envs:
@@ -160,7 +160,7 @@ def train_policy(
             raise InputError(f"{out} holds a finished run without {ZIP_FILE}; train into another folder to have one")
         if not card_file(stem).exists():
             if encoder is not None:
-                save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)).entries)
+                save(encoder, out / TRAITS, read_card(_trait_model(learned, traits)).entries)
             card = _card(identity, encoder)
 
             def make_venv() -> VecEnv:
@@ -193,7 +193,7 @@ def share_training(source: Path, method: str, out: Path, traits: str | Path | No
     shared = read_policy_card(snapshot_stem(source, 100))
     training = {key: shared[key] for key in ("method", "p_conservative", "steps", "seed", "scene")}
     with claim_folder(out, {"kind": "policy", "method": method, "traits": digest(encoder), "training": training}):
-        save(encoder, out / TRAITS, read_card(traits or str(learned.encoder)).entries)
+        save(encoder, out / TRAITS, read_card(_trait_model(learned, traits)).entries)
         for percent in (*SNAPSHOTS_PERCENT, 100):
             stem = snapshot_stem(source, percent)
             entries = {"method": method, "trained_as": learned.trained_as} | _traits_entries(encoder)
@@ -217,9 +217,18 @@ def _sensors_entry(sensors: Sequence[Sensor]) -> dict[str, Any]:
 def _load_encoder(learned: Learned, traits: str | Path | None) -> TraitModel | None:
     if learned.encoder is None:
         return None
-    encoder = trait_models.load(traits or learned.encoder, latent_size=LATENT_SIZE)
-    learned.make_source(encoder, PpoSettings())  # refuses a model of another method where it needs one of its own
+    encoder = trait_models.load(_trait_model(learned, traits), latent_size=LATENT_SIZE)
+    if encoder.method != learned.encoder:
+        raise InputError(
+            f"method {learned.name} needs a trait model of the method {learned.encoder}, not of {encoder.method}; "
+            "give such a model as `traits`"
+        )
     return encoder
+
+
+def _trait_model(learned: Learned, traits: str | Path | None) -> str | Path:
+    """Return the trait model to take, by name or path: the given one, else the shipped one of the method."""
+    return traits or shipped_model(str(learned.encoder))
 
 
 def training_venv(

@@ -195,10 +195,21 @@ class ClassifierTraits(EncoderTraits):
     """The classes that a supervised classifier predicts, in the form of ``OracleTraits``, at the same times.
 
     With a policy trained on true traits this is the pipeline of Ma et al. (2020) as the paper has it (IV-C).
+
+    Raises:
+        InputError: the model is not a classifier with 2 latents.
     """
 
     size = KINDS
     model: Classifier
+
+    def __init__(self, model: TraitModel) -> None:
+        if not isinstance(model, Classifier):
+            raise InputError(
+                f"the classes of drivers are those of a classifier, not of {model.method}; "
+                "give a trait model of the method classifier"
+            )
+        super().__init__(model)
 
     def _policy_input(self, latents: torch.Tensor) -> np.ndarray:
         is_conservative = self.model.logit(latents).cpu().numpy() > 0.0

@@ -16,7 +16,7 @@ from tint_sumo.core.reading import RESULT_BYTES, require_file
 from tint_sumo.envs.rows import BUILT_IN_OUTCOMES
 from tint_sumo.jobs.jobs import THREADS_PER_JOB
 from tint_sumo.methods.evaluation import REPORTED_SET, Evaluation, evaluate
-from tint_sumo.methods.loading import load_policy
+from tint_sumo.methods.loading import load_policy, shipped_policy
 from tint_sumo.methods.registry import METHODS, Rule, find_learned, find_method
 from tint_sumo.methods.training import CURVE_FILE, POLICY, share_training, snapshot_stem, train_policy
 from tint_sumo.scenes import Scene, paper_scene
@@ -189,9 +189,9 @@ def policy_folder(method: str, mix: Mix, seed: int) -> str:
 
 
 def policy_path(out: Path, method: str, mix: Mix | None, seed: int, percent: int = 100) -> str | Path:
-    """Return the file of a policy of the study in ``out`` after part of its training, or a given policy's name."""
+    """Return where a study's policy after part of its training is, or a shipped one; of a rule its name."""
     if mix is None:
-        return method
+        return method if isinstance(find_method(method), Rule) else shipped_policy(method)
     return snapshot_stem(out / policy_folder(method, mix, seed), percent).with_suffix(".safetensors")
 
 

@@ -11,7 +11,7 @@ from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import read_json, shipped, write_json
 from tint_sumo.core.ranges import Range
 from tint_sumo.core.structures import FieldError, build
-from tint_sumo.core.weights import card_file, read_weights, weights_file, write_weights
+from tint_sumo.core.weights import card_file, find_weights, read_weights, write_weights
 from tint_sumo.traits.input_range import InputRange
 from tint_sumo.traits.model import TRAIT_METHODS, TraitModel
 
@@ -55,7 +55,8 @@ def load(name_or_path: str | Path, latent_size: int | None = None) -> TraitModel
     """Return a trained model in evaluation mode, its weights frozen.
 
     Args:
-        name_or_path: name of a shipped model, folder of a training run, or path of a .safetensors file.
+        name_or_path: folder of a training run, path of a .safetensors file, or name of a shipped model; files that are
+            there come before a shipped model of the same name.
         latent_size: the number of latents the caller needs; None accepts any.
 
     Raises:
@@ -119,17 +120,19 @@ def add_to_card(name_or_path: str | Path, entries: Mapping[str, Any]) -> None:
     write_json(card_file(stem), {**_read_card(stem).entries, **entries})
 
 
+def shipped_model(name: str) -> Path:
+    """Return the path of a shipped model without its suffixes: that model, whatever the present folder holds."""
+    return shipped("models") / name
+
+
 def find(name_or_path: str | Path) -> Path:
     """Return the path of a model without its suffixes.
 
     Raises:
         InputError: there is no such model.
     """
-    given = Path(name_or_path)
-    weights = given.with_suffix("") if given.suffix == ".safetensors" else given
-    for stem in (shipped("models") / given, given / RUN_MODEL, weights):
-        if stem.name and weights_file(stem).is_file():
-            return stem
+    if (stem := find_weights(Path(name_or_path), RUN_MODEL, shipped("models"))) is not None:
+        return stem
     known = sorted(file.stem for file in shipped("models").glob("*.safetensors") if _is_trait_model(file))
     raise InputError(
         f"no trait model {name_or_path}; give the folder of a training run, a .safetensors file, "

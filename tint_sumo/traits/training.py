@@ -89,12 +89,12 @@ def train(
         "latent_size": latent_size,
         "settings": asdict(settings),
         "windows": len(windows),
-        "windows_sha256": _digest(windows),
+        "windows_sha256": _digest(windows, model_type, conservative),
         **({} if no_leader_gap_m == NO_LEADER_GAP_M else {"no_leader_gap_m": no_leader_gap_m}),
     }
     with claim_folder(out, identity):
         if (out / f"{RUN_MODEL}.json").exists():
-            return load(out / f"{RUN_MODEL}.safetensors")  # the folder alone could be the name of a shipped model
+            return load(out)
         with preserved_random_state():
             torch.manual_seed(_stream_seed(seed, 0))
             model = model_type(settings, latent_size)
@@ -235,9 +235,14 @@ def _stream_seed(seed: int, stream: int) -> int:
     return int(np.random.SeedSequence((seed, stream)).generate_state(1)[0])
 
 
-def _digest(windows: Windows | WindowFile) -> str:
+def _digest(
+    windows: Windows | WindowFile, method: type[TraitModel], conservative: NDArray[np.bool_] | None = None
+) -> str:
+    """Return a checksum of all that a method learns from; drivers choose the other window, where it takes one."""
     digest = hashlib.sha256()
-    for column in ("states", "length"):
+    for column in ("states", "length", *(("driver",) if method.uses_other_window else ())):
         for part in windows.parts():
             digest.update(np.ascontiguousarray(getattr(part, column)).data)
+    if conservative is not None:
+        digest.update(np.ascontiguousarray(conservative).data)
     return digest.hexdigest()

@@ -13,6 +13,7 @@ from tint_sumo.dataset.windows import Windows, load_drivers, load_labels, load_w
 from tint_sumo.methods.registry import METHODS, Learned
 from tint_sumo.study.page.recording import EPISODES
 from tint_sumo.traits.evaluation import encode_windows
+from tint_sumo.traits.storage import shipped_model
 
 DRAWN = 400  # windows; more would hide each other
 _RECORDED, _SEED = 3000, 404  # unlike that of any dataset a model was trained on
@@ -66,6 +67,6 @@ def _states(windows: Windows, number: int) -> dict[str, list[int | None]]:
 
 def _model(out: Path, name: str, windows: Windows) -> dict[str, Any]:
     trained = out / "traits" / name / "model.safetensors"
-    model = traits.load(trained if trained.exists() else name, latent_size=LATENT_SIZE)
+    model = traits.load(trained if trained.exists() else shipped_model(name), latent_size=LATENT_SIZE)
     latents = encode_windows(model, windows).mean
     return {"is_trained": trained.exists(), "latents": np.round(latents.astype(float), 3).tolist()}

@@ -41,11 +41,13 @@ def shipped(name: str) -> Path:
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; rename it to ``path`` only if the block succeeds.
 
+    It is absolute: Arrow takes a relative one such as ``run:1/table.parquet`` for a URL.
+
     Raises:
         OSError: the system refuses to write the file; it names ``path``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.absolute().with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
         partial.replace(path)

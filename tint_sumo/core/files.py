@@ -37,6 +37,11 @@ def shipped(name: str) -> Path:
     return _PACKAGE.parent / ("data/models" if name == "models" else name)
 
 
+def at_home(path: str) -> str:
+    """Return a path with the user's home folder for a leading ``~/``, as where no shell has put it in."""
+    return os.path.expanduser(path) if path.startswith("~/") else path
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; rename it to ``path`` only if the block succeeds.

@@ -231,10 +231,13 @@ def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bo
         with_versions: note the versions of packages, too; leave them out if the run writes them elsewhere.
 
     Raises:
-        InputError: the folder holds another run or files of unknown origin, or another process is working there.
+        InputError: the folder holds another run or files of unknown origin, another process is working there, or a
+            command begins a run in the folder of another one.
         OSError: the folder cannot be written to, or has no room.
     """
     wanted = json.loads(json.dumps(settings))
+    if present_origin() is not None:  # the parts of a run lie in its folder
+        _require_no_run(folder.resolve().parent, "out")
     _require_home(folder, wanted)
     _require_writable(folder, "out")
     folder.mkdir(parents=True, exist_ok=True)

@@ -147,10 +147,10 @@ def parse(words: list[str]) -> Command:
         parsed = tyro.cli(TintSumo, prog="tint-sumo", args=words, default=default, config=with_pairs)
     while not isinstance(parsed, Command):
         parsed = parsed.command
-    parsed = _at_home(parsed)
-    _require_paths(parsed)
-    require_ranges(parsed)
-    return parsed
+    command = _at_home(parsed)
+    _require_paths(command)
+    require_ranges(command)
+    return command
 
 
 def _with_build(words: list[str]) -> list[str]:
@@ -171,7 +171,9 @@ def _require_each_once(words: Sequence[str]) -> None:
 def _at_home(command: Command) -> Command:
     """Return the command with the user's home folder for a leading ``~/`` of its paths, which a shell may have left."""
     values = {field.name: getattr(command, field.name) for field in fields(command)}
-    paths = {name: type(value)(at_home(str(value))) for name, value in values.items() if isinstance(value, str | Path)}
+    paths: dict[str, Any] = {
+        name: type(value)(at_home(str(value))) for name, value in values.items() if isinstance(value, str | Path)
+    }
     return replace(command, **paths)
 
 

@@ -39,7 +39,9 @@ def shipped(name: str) -> Path:
 
 def at_home(path: str) -> str:
     """Return a path with the user's home folder for a leading ``~/``, as where no shell has put it in."""
-    return os.path.expanduser(path) if path.startswith("~/") else path
+    if not path.startswith("~/"):
+        return path
+    return os.path.expanduser(path)  # noqa: PTH111 - Path.expanduser fails where there is no home
 
 
 @contextmanager

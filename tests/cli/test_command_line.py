@@ -147,6 +147,7 @@ def test_argument_errors_exit_with_2(argv: list[str], capsys: pytest.CaptureFixt
         ("policy evaluate --model ttc --episodes 0", "episodes"),
         ("policy evaluate --model ttc --seed -1", "seed"),
         ("policy train --method oracle --out s3://bucket/run", "--out of this command is a path on this machine"),
+        ("record --out s3:/bucket/data", "--out is neither a folder nor a URL; give two slashes"),
         ("traits evaluate --data file:///data --model MODEL", "--data of this command is a path on this machine"),
         ("policy sweep --set n_epochs=2 --set gamma=0.9 --out OUT", "--set is given twice; give it once"),
         ("policy evaluate --model ttc --p_conservative 0.1 --p-conservative=0.9", "--p-conservative is given twice"),

@@ -124,6 +124,14 @@ def test_flags_win_over_the_file(tmp_path: Path) -> None:
     assert parse(["record", f"--config={file}", "--no-json"]).json is False
 
 
+def test_the_home_folder_is_found_where_no_shell_puts_it_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    written(tmp_path, 'out: ~/data\nsumocfg: "~/mine.sumocfg"')
+    found = parse(["record", "--config=~/config.yaml"])
+    assert (found.out, found.sumocfg) == (str(tmp_path / "data"), tmp_path / "mine.sumocfg")
+    assert parse(["record", "--out", "~data"]).out == "~data"
+
+
 def test_what_must_be_given_may_come_from_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = str(written(tmp_path, "method: oracle"))
     with pytest.raises(SystemExit) as stop:

@@ -18,6 +18,14 @@ def test_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert json.loads((out / "manifest.json").read_text()) == printed
 
 
+def test_a_folder_may_have_a_colon_in_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    printed = run(capsys, "record", "--windows", 20, "--out", "run-06:12")
+    assert run(capsys, "dataset", "inspect", "run-06:12", "--verify")["manifest"] == printed
+
+
 def test_record_in_the_format_of_sumo(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = copy(dataset, tmp_path / "copy")
     run(capsys, "record", "--windows", 100, "--out", out, "--format", "fcd")

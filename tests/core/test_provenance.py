@@ -90,6 +90,16 @@ def test_parts_of_a_run_are_told_of_once(tmp_path: Path) -> None:
     assert {path.parent.name for path in tmp_path.rglob("provenance.json")} == {"study"}
 
 
+def test_a_command_begins_no_run_in_the_folder_of_another(tmp_path: Path) -> None:
+    claim(tmp_path / "study")
+    (tmp_path / "link").symlink_to(tmp_path / "study")
+    with made_by(ORIGIN):
+        for folder in (tmp_path / "study" / "logs" / "mine", tmp_path / "link" / "mine"):
+            with pytest.raises(InputError, match=r"study.* the folder of a run; choose another `out`"):
+                claim(folder)
+    assert set(files(tmp_path / "study")) == {"run.json", ".lock"}
+
+
 def test_a_run_killed_at_its_beginning_does_not_stand_in_the_way_and_a_file_of_the_user_does(tmp_path: Path) -> None:
     run, mine = tmp_path / "run", tmp_path / "mine"
     for folder in (run, mine):

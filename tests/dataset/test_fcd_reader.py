@@ -115,6 +115,15 @@ def test_parquet_is_the_same_but_for_decimals(folder: Path, expected: pd.DataFra
     pd.testing.assert_frame_equal(found, expected, rtol=0.0, atol=0.0051)
 
 
+def test_parquet_may_be_in_a_folder_with_a_colon_in_its_name(
+    folder: Path, expected: pd.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "run:1").mkdir()
+    write(folder, "fcd.parquet").rename(tmp_path / "run:1" / "fcd.parquet")
+    monkeypatch.chdir(tmp_path)
+    assert len(read_fcd(Path("run:1/fcd.parquet"))) == len(expected)
+
+
 def test_tracks_follow_in_the_same_order(folder: Path) -> None:
     whole, *others = (read_tracks(write(folder, f"fcd.{suffix}")) for suffix in ("xml", "csv", "parquet"))
     assert whole["vehicle"].drop_duplicates().tolist() == VEHICLES

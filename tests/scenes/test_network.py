@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 import sumolib
 
+from tint_sumo.core.errors import InputError
 from tint_sumo.scenes import SCENES, T_INTERSECTION, find_scene
 from tint_sumo.scenes.build import NET_FILE, write_scene
 from tint_sumo.scenes.layout import layout
-from tint_sumo.scenes.network import name, replica_origin
+from tint_sumo.scenes.network import build_network, name, plain_xml, replica_origin
+from tint_sumo.scenes.sumo_config import read_config
+from tint_sumo.simulation.vtypes import read_vtype_table
 
 REPLICAS = 18  # more than one row
 
@@ -25,6 +28,25 @@ def test_each_lane_of_the_t_intersection_crosses_its_own_priority_junction(net: 
         assert node.getType() == "priority"
         assert net.getEdge(name(route.edges[0], 3)).getToNode() is node
         assert net.getEdge(name(route.edges[1], 3)).getFromNode() is node
+
+
+@pytest.mark.parametrize("work", ["network", "configuration", "vTypes"])
+def test_a_temporary_folder_that_sumo_cannot_name_is_refused(
+    work: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / ("own.sumocfg" if work == "configuration" else "own.add.xml")
+    file.write_text("<sumoConfiguration/>" if work == "configuration" else "<additional/>", encoding="utf-8")
+    folder = tmp_path / "a, b"
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    build_network.cache_clear()
+    with pytest.raises(InputError, match="a, b, for it splits paths at commas; set TMPDIR"):
+        if work == "network":
+            build_network(plain_xml(find_scene(T_INTERSECTION).network, 1))
+        elif work == "configuration":
+            read_config(file)
+        else:
+            read_vtype_table(file)
 
 
 @pytest.mark.parametrize("replica", [0, 7, REPLICAS - 1])

@@ -2,10 +2,11 @@
 
 import io
 import json
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -27,6 +28,7 @@ from tint_sumo.cli.study import Study
 from tint_sumo.cli.tracks import Tracks
 from tint_sumo.cli.traits import Traits
 from tint_sumo.core.errors import BAD_PATHS, InputError, JobError, system_problem
+from tint_sumo.core.files import at_home
 from tint_sumo.core.processes import end_quickly, interrupt_on_sigterm
 from tint_sumo.core.provenance import Origin, made_by, version_text
 from tint_sumo.core.ranges import require_ranges
@@ -38,6 +40,7 @@ _COMPLETION = arg(
     help="Print a script that completes commands and flags in that shell, and do nothing else. For bash, put this line "
     'into ~/.bashrc: eval "$(tint-sumo --print-completion bash)".'
 )
+_ONE_SLASH = re.compile(r"[a-z][a-z0-9]*:/(?!/)")  # a mistyped URL
 _TYRO = (OmitArgPrefixes, OmitSubcommandPrefixes, FlagCreatePairsOff)
 
 
@@ -145,9 +148,10 @@ def parse(words: list[str]) -> Command:
         parsed = tyro.cli(TintSumo, prog="tint-sumo", args=words, default=default, config=with_pairs)
     while not isinstance(parsed, Command):
         parsed = parsed.command
-    _require_paths(parsed)
-    require_ranges(parsed)
-    return parsed
+    command = _at_home(parsed)
+    _require_paths(command)
+    require_ranges(command)
+    return command
 
 
 def _with_build(words: list[str]) -> list[str]:
@@ -165,9 +169,22 @@ def _require_each_once(words: Sequence[str]) -> None:
             raise InputError(f"{flag} is given twice; give it once, with all of its values behind it")
 
 
+def _at_home(command: Command) -> Command:
+    """Return the command with the user's home folder for a leading ``~/`` of its paths, which a shell may have left."""
+    values = {field.name: getattr(command, field.name) for field in fields(command)}
+    paths: dict[str, Any] = {
+        name: type(value)(at_home(str(value))) for name, value in values.items() if isinstance(value, str | Path)
+    }
+    return replace(command, **paths)
+
+
 def _require_paths(command: Command) -> None:
     """Raise InputError if a URL is given where a path belongs: it would become a folder with a strange name."""
     for name, value in vars(command).items():
+        if isinstance(value, str) and _ONE_SLASH.match(value):
+            raise InputError(
+                f"{flag_of(name)} is neither a folder nor a URL; give two slashes, as in s3://bucket/folder"
+            )
         if isinstance(value, Path) and value.parts and value.parts[0].endswith(":"):
             raise InputError(
                 f"{flag_of(name)} of this command is a path on this machine, not a URL; only record, traits "

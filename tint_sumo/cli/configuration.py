@@ -10,6 +10,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from tint_sumo.core.files import at_home
 from tint_sumo.core.redaction import redact
 from tint_sumo.core.structures import FieldError, Where, build, choose, is_required, require_fields
 from tint_sumo.core.yaml_files import YamlFile, field_notes, read_yaml, to_yaml
@@ -57,7 +58,7 @@ def config_of(words: Sequence[str]) -> Path | None:
     parser = argparse.ArgumentParser(prog="tint-sumo", add_help=False, allow_abbrev=False)
     parser.add_argument(CONFIG_FLAG, type=Path, nargs="?")  # tyro says that its value is missing
     found: Path | None = parser.parse_known_args(words)[0].config
-    return found
+    return None if found is None else Path(at_home(str(found)))
 
 
 def commands_named(root: type, words: Sequence[str]) -> list[type]:

@@ -37,15 +37,24 @@ def shipped(name: str) -> Path:
     return _PACKAGE.parent / ("data/models" if name == "models" else name)
 
 
+def at_home(path: str) -> str:
+    """Return a path with the user's home folder for a leading ``~/``, as where no shell has put it in."""
+    if not path.startswith("~/"):
+        return path
+    return os.path.expanduser(path)  # noqa: PTH111 - Path.expanduser fails where there is no home
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; rename it to ``path`` only if the block succeeds.
+
+    It is absolute: Arrow takes a relative one such as ``run:1/table.parquet`` for a URL.
 
     Raises:
         OSError: the system refuses to write the file; it names ``path``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.absolute().with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
         partial.replace(path)
@@ -246,10 +255,13 @@ def claim_folder(folder: Path, settings: Mapping[str, Any], *, with_versions: bo
         with_versions: note the versions of packages, too; leave them out if the run writes them elsewhere.
 
     Raises:
-        InputError: the folder holds another run or files of unknown origin, or another process is working there.
+        InputError: the folder holds another run or files of unknown origin, another process is working there, or a
+            command begins a run in the folder of another one.
         OSError: the folder cannot be written to, or has no room.
     """
     wanted = json.loads(json.dumps(settings))
+    if present_origin() is not None:  # the parts of a run lie in its folder
+        _require_no_run(folder.resolve().parent, "out")
     _require_home(folder, wanted)
     _require_writable(folder, "out")
     folder.mkdir(parents=True, exist_ok=True)

@@ -245,7 +245,7 @@ def _named(line: str) -> tuple[str, Sequence[str]] | None:
 
 def _read_parquet(file: Path, columns: FcdColumns) -> pd.DataFrame:
     require_table(file, _ROLE)
-    schema = pq.read_schema(file)
+    schema = pq.read_schema(file.absolute())
     is_nameless = not any(schema.names)  # --output.column-header none
     usual = (names for names in (_USUAL, _WITH_HEIGHT) if len(names) == len(schema.names))
     position = _positions(next(usual, ()) if is_nameless else schema.names)
@@ -253,7 +253,7 @@ def _read_parquet(file: Path, columns: FcdColumns) -> pd.DataFrame:
     wanted = _wanted(found, position)
     numbers = [position[attribute] for attribute in wanted]
     texts = [schema.names[number] for number in numbers if pa.types.is_string(schema.field(number).type)]
-    with pq.ParquetFile(file, read_dictionary=texts) as content:  # each id is in memory once
+    with pq.ParquetFile(file.absolute(), read_dictionary=texts) as content:  # each id is in memory once
         if is_nameless:
             table = content.read().select(numbers)
         else:

@@ -174,7 +174,8 @@ def read_shard(file: Path, columns: list[str] | None = None) -> pd.DataFrame:
         InputError: the file is missing or damaged.
     """
     with _mendable(file):
-        rows = pd.read_parquet(file, columns=columns, read_dictionary=["route", "trait"])  # texts once each
+        texts = ["route", "trait"]  # once each
+        rows = pd.read_parquet(file.absolute(), columns=columns, read_dictionary=texts)
     _require_numbers(file, rows)
     return rows
 
@@ -221,7 +222,7 @@ def read_shard_metadata(file: Path) -> pq.FileMetaData:
         InputError: the file is missing or damaged.
     """
     with _mendable(file):
-        return pq.read_metadata(file)
+        return pq.read_metadata(file.absolute())
 
 
 def require_table(file: Path, what: str) -> None:
@@ -232,7 +233,7 @@ def require_table(file: Path, what: str) -> None:
         ValueError or OSError: it is damaged.
     """
     require_file(file, what, TABLE_BYTES)
-    metadata = pq.read_metadata(file)
+    metadata = pq.read_metadata(file.absolute())  # Arrow takes a relative path such as run:1/a.parquet for a URL
     groups = (metadata.row_group(index) for index in range(metadata.num_row_groups))
     encoded_bytes = sum(group.total_byte_size for group in groups)
     numbers_bytes = metadata.num_rows * metadata.num_columns * np.dtype(np.float64).itemsize

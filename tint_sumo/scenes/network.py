@@ -160,13 +160,28 @@ def sumo_program(program: str) -> str:
     return str(path)
 
 
+def require_sumo_opens_temporary_files() -> None:
+    """Check the folder of temporary files.
+
+    Raises:
+        InputError: its path has a comma; SUMO, which takes lists of files, splits all paths there.
+    """
+    if "," in tempfile.gettempdir():
+        raise InputError(
+            f"SUMO cannot open temporary files in {tempfile.gettempdir()}, for it splits paths at commas; "
+            "set TMPDIR to a folder without one"
+        )
+
+
 @lru_cache(maxsize=8)  # copies of an environment, and one that begins anew, need the same network again
 def build_network(sources: PlainXml) -> str:
     """Run netconvert on the sources and return the text of the network, without its dated header.
 
     Raises:
+        InputError: the folder of temporary files has a comma in its path.
         OSError: the system refuses room for temporary files, or something else that netconvert needs.
     """
+    require_sumo_opens_temporary_files()
     with tempfile.TemporaryDirectory() as folder:
         files = {kind: Path(folder) / f"net.{kind}.xml" for kind in ("nod", "edg", "con", "net")}
         files["nod"].write_text(sources.nodes, encoding="utf-8")

@@ -23,7 +23,7 @@ from sumolib.miscutils import parseTime
 from tint_sumo.config import MOST_LABELS
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.reading import TABLE_BYTES, require_file
-from tint_sumo.scenes.network import sumo_program
+from tint_sumo.scenes.network import require_sumo_opens_temporary_files, sumo_program
 
 DEFAULT_VTYPE = "DEFAULT_VEHTYPE"  # SUMO's type for vehicles that name none
 _VTYPE_OF_MODE = {"car": DEFAULT_VTYPE, "bicycle": "DEFAULT_BIKETYPE"}  # vehicles that SUMO makes for person trips
@@ -157,6 +157,7 @@ def _is_kept(section: str, option: str) -> bool:
 
 def _ask_sumo(file: Path) -> list[tuple[str, str, str]]:
     """Return section, name and value of each option of a configuration, with the names that SUMO prefers."""
+    require_sumo_opens_temporary_files()
     with tempfile.TemporaryDirectory(prefix="tint_sumo_") as folder:
         here, there = str(file.parent), Path(folder) / "input"
         there.symlink_to(here)

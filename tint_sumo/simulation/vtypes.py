@@ -12,6 +12,7 @@ import sumolib
 from tint_sumo.core.errors import InputError
 from tint_sumo.core.files import shipped
 from tint_sumo.core.reading import TABLE_BYTES, require_file
+from tint_sumo.scenes.network import require_sumo_opens_temporary_files
 from tint_sumo.scenes.sumo_config import base_vtype, read_config
 from tint_sumo.scenes.sumo_run import why_not_loaded
 from tint_sumo.simulation.connection import connect
@@ -44,6 +45,7 @@ def read_vtype_table(file: Path) -> Mapping[str, VType]:
         f"<vType {' '.join(f'{name}={quoteattr(vtype[name])}' for name in _ATTRIBUTES if name in vtype)}/>"
         for vtype in defined.values()
     ]
+    require_sumo_opens_temporary_files()
     with TemporaryDirectory(prefix="tint_sumo_") as folder:
         additional = Path(folder) / "vtypes.add.xml"
         additional.write_text(f"<additional>{''.join(elements)}</additional>", encoding="utf-8")

@@ -131,7 +131,7 @@ def test_argument_errors_exit_with_2(argv: list[str], capsys: pytest.CaptureFixt
         ("policy train --method oracle --p-conservative -0.1 --out OUT", "p_conservative"),
         ("policy train --method oracle --p-conservative 0.6 0.2 --out OUT", "from low to high"),
         ("policy train --method oracle --p-conservative 0.1 0.2 0.3 --out OUT", "a probability in [0, 1], or two"),
-        ("policy train --method streaming --traits MODEL --out OUT", "of a cross_window model, not of vae"),
+        ("policy train --method streaming --traits MODEL --out OUT", "of the method cross_window, not of vae"),
         ("policy train --method oracle --steps 0 --out OUT", "steps"),
         ("policy train --method oracle --scene moon --out OUT", "unknown scene 'moon'"),
         ("policy train --method vae --traits nobody --out OUT", "no trait model nobody"),

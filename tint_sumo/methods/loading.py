@@ -186,7 +186,7 @@ def find_policy(name_or_path: str | Path) -> Path:
     Raises:
         InputError: there is no such policy.
     """
-    folder = shipped("models") / "policies"
+    folder = _shipped_folder()
     if (stem := find_weights(Path(name_or_path), POLICY, folder)) is not None:
         return stem
     if (Path(name_or_path) / "run.json").exists():
@@ -201,7 +201,11 @@ def find_policy(name_or_path: str | Path) -> Path:
 
 def shipped_policy(name: str) -> Path:
     """Return the path of a shipped policy without its suffix: that policy, whatever the present folder holds."""
-    return shipped("models") / "policies" / name
+    return _shipped_folder() / name
+
+
+def _shipped_folder() -> Path:
+    return shipped("models") / "policies"
 
 
 def shipped_policies() -> list[str]:

@@ -21,14 +21,14 @@ def is_on_edge(lane: str) -> bool:
 
 
 class _Ahead(NamedTuple):
-    """How far a lane leads along a route, and over which connection."""
+    """Number of edges of a route that a lane reaches, and the connection to the next of them."""
 
     edges: int  # number of edges of the route, its own included, that an ego reaches without changing lanes
     way: Any  # sumolib's connection to the lane on the next of these edges; None on the last
 
 
 def _ahead(lane: Any, after: Mapping[str, _Ahead]) -> _Ahead:
-    """Return how far a lane leads, from how far each lane of the next edge does, by its id."""
+    """Return how many edges a lane reaches, from the numbers that the lanes of the next edge reach, by their ids."""
     ways = [way for way in lane.getOutgoing() if way.getToLane().getID() in after]
     best = max(ways, key=lambda way: after[way.getToLane().getID()].edges, default=None)
     return _Ahead(1, None) if best is None else _Ahead(1 + after[best.getToLane().getID()].edges, best)
@@ -130,7 +130,7 @@ class Routes:
         return found
 
     def _open_lanes(self, route: Sequence[str]) -> list[dict[str, "_Ahead"]]:
-        """Return how far each lane that is open to an ego leads, by its id, for each edge of a route."""
+        """Return how many edges each lane that is open to an ego reaches, by its id, for each edge of a route."""
         found: list[dict[str, _Ahead]] = [{}]
         for edge in reversed(route):
             after = found[0]

@@ -1,4 +1,4 @@
-"""How recorded vehicles move from row to row: the way driven, jumps, missing frames, and whether speeds agree."""
+"""Compute the steps of recorded tracks: distance driven, speed, acceleration, position jumps and missing frames."""
 
 import math
 from dataclasses import dataclass
@@ -18,8 +18,9 @@ _NOISY_M = 2.0  # the direction of a shorter step is that of the way around it: 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Changes from each row to the next one of its track; all (S,)."""
+    """Changes from each row to the next one of its track; arrays (S,)."""
 
+    usual_s: float  # median time of a step; 0 if there is none
     row: NDArray[np.int64]  # the later of the two
     time_s: NDArray[np.float64]
     driven_m: NDArray[np.float64]  # along the way, below 0 where noise or the vehicle goes back
@@ -27,15 +28,6 @@ class Steps:
     acceleration_mps2: NDArray[np.float64]
     is_long: NDArray[np.bool_]  # frames are missing between the rows
     is_jump: NDArray[np.bool_]  # farther than the speeds and any acceleration allow
-
-    @property
-    def usual_s(self) -> float:
-        """Median time of a step; 0 if there is none."""
-        return _usual_s(self.time_s)
-
-
-def _usual_s(time_s: NDArray[np.float64]) -> float:
-    return float(np.median(time_s)) if len(time_s) else 0.0
 
 
 def steps_of(tracks: Tracks) -> Steps:
@@ -50,13 +42,15 @@ def steps_of(tracks: Tracks) -> Steps:
     step_s = time_s[row] - time_s[row - 1]
     straight_m = np.hypot(x_m[row] - x_m[row - 1], y_m[row] - y_m[row - 1])
     fastest_m = np.maximum(speed_mps[row], speed_mps[row - 1]) * step_s + MOST_ACCELERATION_MPS2 * step_s**2 / 2.0
-    is_long, is_jump = step_s > _LONG_STEP * _usual_s(step_s), straight_m > fastest_m + _JUMP_M
+    usual_s = float(np.median(step_s)) if len(step_s) else 0.0
+    is_long, is_jump = step_s > _LONG_STEP * usual_s, straight_m > fastest_m + _JUMP_M
     begins = np.ones(len(track), np.bool_)  # of parts without a break
     begins[row] = is_long | is_jump
     driven_m = np.zeros(len(track))
     driven_m[row] = straight_m
     _write_driven(np.cumsum(begins), x_m, y_m, driven_m)
     return Steps(
+        usual_s,
         row,
         step_s,
         driven_m[row],
